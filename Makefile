@@ -1,0 +1,74 @@
+# make setup | run | test | lab | bench | notebooks | lint | lock | clean
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.complete
+BENCH := .venv-bench
+BENCH_STAMP := $(BENCH)/.complete
+INPUTS := environment.txt constraints.txt pyproject.toml
+
+.PHONY: help setup run test lint lab notebooks bench lock clean
+
+help:
+	@echo "make setup      build $(VENV) from environment.txt and install the project into it"
+	@echo "make run        all studies: table, figures, build/report.html"
+	@echo "make test       linters, unit tests, every notebook"
+	@echo "make lab        open the notebooks in JupyterLab"
+	@echo "make notebooks  execute the notebooks again, in place, byte-reproducibly"
+	@echo "make bench      speed, beside other packages; table and build/bench.json"
+
+# install FOLDER, ARGUMENTS: uv where it can be had (faster), pip otherwise
+define install
+	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if (3, 11) <= v < (3, 14) else \
+	  f"linetrack needs Python 3.11, 3.12 or 3.13; $(PYTHON) is {v[0]}.{v[1]}. Try: make PYTHON=python3.11 ...")'
+	@$(PYTHON) -c 'import ensurepip' 2>/dev/null || \
+	  { echo "Python lacks venv: apt install python3-venv"; exit 1; }
+	@rm -rf $(1)
+	$(PYTHON) -m venv $(1)
+	@if $(1)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt uv; then \
+	  echo "uv pip install $(2)"; \
+	  VIRTUAL_ENV=$(1) $(1)/bin/uv pip install --quiet $(2); \
+	else \
+	  echo "pip install $(2)"; \
+	  $(1)/bin/python -m pip install --quiet --disable-pip-version-check $(2); \
+	fi
+endef
+
+setup: $(STAMP)
+
+$(STAMP): $(INPUTS)
+	$(call install,$(VENV),-r environment.txt -e .)
+	@touch $@
+	@echo "ready: make run, make test, make lab"
+
+run: setup
+	$(BIN)/python -m raytransfer --output build
+
+test: setup lint
+	$(BIN)/python -m pytest
+
+lint: setup
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+
+lab: setup
+	$(BIN)/jupyter lab --notebook-dir notebooks
+
+notebooks: setup
+	$(BIN)/python notebooks/execute.py
+
+$(BENCH_STAMP): $(INPUTS) benchmarks/peers.txt
+	$(call install,$(BENCH),-r environment.txt -r benchmarks/peers.txt -e .)
+	@touch $@
+
+bench: $(BENCH_STAMP)
+	$(BENCH)/bin/python -m benchmarks
+
+# --universal: one file for x86_64 and aarch64, Python 3.11 to 3.13
+lock: setup
+	grep -v '^-c' environment.txt | $(BIN)/uv pip compile --universal --python-version 3.11 --upgrade \
+	  --no-header --no-annotate --no-emit-index-url --quiet - -o constraints.txt
+
+clean:
+	rm -rf $(VENV) $(BENCH) build .mypy_cache .pytest_cache .ruff_cache

@@ -1,0 +1,297 @@
+"""Lenses on an axis: matrices in both meridians, cardinal points, the thesis's systems.
+
+The optical frame: Z with the light, X along the sensor's pixel line, Y up. Distances are in mm.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import reduce
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from raytransfer import _checks as check
+from raytransfer.lenses import CATALOGUE, THESIS_LENSES, Element, Lens, Meridian
+from raytransfer.materials import D_LINE
+from raytransfer.matrices import RayMatrix, trans_mat
+from raytransfer.sensors import TCD1304, LineSensor
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+
+class Placed(NamedTuple):
+    """An element and where its two vertices are, mm behind the system's first vertex."""
+
+    element: Element
+    front: float
+    back: float
+
+
+@dataclass(frozen=True)
+class CardinalPoints:
+    """The six cardinal points of a system in air, in one meridian; all in mm.
+
+    Front points are measured from the system's first vertex, back points from its last; positive
+    is with the light. The nodal points coincide with the principal points, because there is air on
+    both sides. An afocal system has all of them at infinity.
+    """
+
+    effective_focal_length: float
+    front_focal_point: float
+    back_focal_point: float
+    front_principal_point: float
+    back_principal_point: float
+
+    @property
+    def front_nodal_point(self) -> float:
+        """The front principal point, because there is air on both sides."""
+        return self.front_principal_point
+
+    @property
+    def back_nodal_point(self) -> float:
+        """The back principal point, because there is air on both sides."""
+        return self.back_principal_point
+
+
+@dataclass(frozen=True)
+class OpticalSystem:
+    """Elements along the optical axis, front (where the light enters) to back.
+
+    Parameters
+    ----------
+    name : str
+    elements : tuple of Lens and Plate
+    gaps : tuple of float
+        Air between the vertices of one element and the next, mm, ≥ 0: one fewer than elements.
+    sensor_distance : float, optional
+        Air from the last vertex to the sensor's chip, mm.
+
+    Raises
+    ------
+    ValueError
+        If there is no element, the number of gaps does not fit, or a distance is negative.
+    """
+
+    name: str
+    elements: tuple[Element, ...]
+    gaps: tuple[float, ...] = ()
+    sensor_distance: float | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "elements", tuple(self.elements))
+        object.__setattr__(self, "gaps", tuple(self.gaps))
+        if not self.elements:
+            raise ValueError(f"{self.name}: a system has at least one element")
+        if len(self.gaps) != len(self.elements) - 1:
+            raise ValueError(
+                f"{self.name}: {len(self.elements)} elements have {len(self.elements) - 1} gaps "
+                f"between them, not {len(self.gaps)}"
+            )
+        for number, gap in enumerate(self.gaps):
+            before, after = self.elements[number : number + 2]
+            check.not_negative(
+                f"gap between {before.part} and {after.part}",
+                gap,
+                "elements stand front to back and cannot overlap",
+            )
+        if self.sensor_distance is not None:
+            check.not_negative("sensor_distance", self.sensor_distance)
+
+    @property
+    def length(self) -> float:
+        """From the first vertex to the last, mm."""
+        return sum(element.thickness for element in self.elements) + sum(self.gaps)
+
+    def layout(self) -> tuple[Placed, ...]:
+        """Return every element with its place on the axis, for drawing and building."""
+        placed, front = [], 0.0
+        for element, gap in zip(self.elements, (*self.gaps, 0.0), strict=True):
+            back = front + element.thickness
+            placed.append(Placed(element, front, back))
+            front = back + gap
+        return tuple(placed)
+
+    def matrix(
+        self, meridian: Meridian, *, plates: bool = True, wavelength: float = D_LINE
+    ) -> RayMatrix:
+        """Paraxial matrix from the first vertex to the last.
+
+        Parameters
+        ----------
+        meridian : {"x", "y"}
+            x holds the pixel line, y is across it. What bends one of them is a plate of glass in
+            the other.
+        plates : bool
+            False leaves these plates and windows out, as the thesis does: air of their thickness.
+        wavelength : float
+            µm.
+        """
+        parts = [
+            element.matrix(meridian, plates=plates, wavelength=wavelength)
+            for element in self.elements
+        ]
+        for number, gap in reversed(list(enumerate(self.gaps, start=1))):
+            parts.insert(number, trans_mat(gap))
+        return reduce(lambda before, part: part @ before, parts)
+
+    def trace(
+        self, rays: ArrayLike, meridian: Meridian, *, plates: bool = True
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Follow paraxial rays from vertex to vertex.
+
+        Parameters
+        ----------
+        rays : array_like, shape (2, N)
+            Heights (mm) and angles (rad) at the first vertex, before it refracts.
+        meridian : {"x", "y"}
+        plates : bool
+            As for `matrix`.
+
+        Returns
+        -------
+        z : ndarray, shape (V,)
+            The vertices, mm behind the first.
+        rays : ndarray, shape (V, 2, N)
+            Heights and angles there; angles in the air before an element at its front vertex,
+            behind it at its back vertex.
+        """
+        here = np.asarray(rays, dtype=float)
+        z: list[float] = []
+        path: list[NDArray[np.float64]] = []
+        for element, front, back in self.layout():
+            if z:
+                here = trans_mat(front - z[-1]) @ here
+            z += [front, back]
+            path.append(here)
+            here = element.matrix(meridian, plates=plates) @ here
+            path.append(here)
+        return np.array(z), np.stack(path)
+
+    def cardinal_points(
+        self, meridian: Meridian, *, plates: bool = True, wavelength: float = D_LINE
+    ) -> CardinalPoints:
+        """Return focal, principal and nodal points in one meridian."""
+        m = self.matrix(meridian, plates=plates, wavelength=wavelength)
+        if m.C == 0:
+            return CardinalPoints(*[math.inf] * 5)
+        # Hecht, Optics, section 6.2, for a matrix that acts on (height, angle) in air
+        return CardinalPoints(
+            effective_focal_length=-1 / m.C,
+            front_focal_point=m.D / m.C,
+            back_focal_point=-m.A / m.C,
+            front_principal_point=(m.D - 1) / m.C,
+            back_principal_point=(1 - m.A) / m.C,
+        )
+
+    def effective_focal_length(
+        self, meridian: Meridian, *, plates: bool = True, wavelength: float = D_LINE
+    ) -> float:
+        """Effective focal length in mm, −1/C; infinite without power."""
+        points = self.cardinal_points(meridian, plates=plates, wavelength=wavelength)
+        return points.effective_focal_length
+
+    def back_focal_length(
+        self, meridian: Meridian, *, plates: bool = True, wavelength: float = D_LINE
+    ) -> float:
+        """From the last vertex to the focus of parallel light, mm; infinite without power."""
+        points = self.cardinal_points(meridian, plates=plates, wavelength=wavelength)
+        return points.back_focal_point
+
+
+def _lens(lens: Lens | str) -> Lens:
+    if isinstance(lens, Lens):
+        return lens
+    known = {**CATALOGUE, **THESIS_LENSES}
+    if lens not in known:
+        raise ValueError(f"lens {lens!r}: known are {', '.join(known)}")
+    return known[lens]
+
+
+def telecentric_pair(
+    front: Lens | str = "PCX_30_32_60", back: Lens | str | None = None, gap: float = 0.0
+) -> OpticalSystem:
+    """Two plano-convex lenses that bend x, curved sides facing each other (listing 4.2).
+
+    Parameters
+    ----------
+    front, back : Lens or name in `CATALOGUE` or `THESIS_LENSES`
+        `back` left out is the same as `front`.
+    gap : float
+        Air between the curved sides, mm; 0 as the thesis simulates it.
+    """
+    first = _lens(front)
+    second = first if back is None else _lens(back)
+    name = f"pair {first.part} + {second.part}"
+    elements = (_oriented(first, "x", plane_first=True), _oriented(second, "x", plane_first=False))
+    return OpticalSystem(name, elements, (gap,))
+
+
+def collimating_pair(
+    concave: Lens | str = "PCV_15_30_20", convex: Lens | str = "PCX_15_30_20", gap: float = 32.0
+) -> OpticalSystem:
+    """A plano-concave and a plano-convex lens that bend y, curved sides to the light (listing 4.3).
+
+    The thesis simulates a gap of 32 mm; its head, figure 4.7, has 40 − 3 − 5.2 = 31.8 mm.
+    """
+    first, second = (_oriented(_lens(lens), "y", plane_first=False) for lens in (concave, convex))
+    return OpticalSystem(f"collimator {first.part} + {second.part}", (first, second), (gap,))
+
+
+def _oriented(lens: Lens, meridian: Meridian, *, plane_first: bool) -> Lens:
+    lens = lens.bending(meridian)
+    return lens if lens.reversed == plane_first else lens.turned()
+
+
+def _lenses(system: OpticalSystem) -> tuple[Lens, Lens]:
+    match system.elements:
+        case (Lens() as first, Lens() as second):
+            return first, second
+    raise ValueError(f"{system.name}: a pair of two lenses is needed")
+
+
+def prototype_head(
+    sensor: LineSensor = TCD1304,
+    pair: OpticalSystem | None = None,
+    collimator: OpticalSystem | None = None,
+    *,
+    concave_height: float = 40.0,
+    concave_to_pair: float = 2.63,
+    pair_height: float = 25.4,
+    convex_height: float = 3.0,
+) -> OpticalSystem:
+    """Return the head of figure 4.7: collimator around the pair, above the sensor's window.
+
+    Parameters
+    ----------
+    sensor : LineSensor
+        Its window and the air below it become part of the system.
+    pair, collimator : OpticalSystem, optional
+        The four lenses; the thesis's when left out. Their own gaps are replaced by what follows
+        from the heights.
+    concave_height, pair_height, convex_height : float
+        Height in mm above the window's top of each element's lower vertex (figure 4.7, section
+        4.2.1).
+    concave_to_pair : float
+        Air in mm between the concave lens and the pair. With the thesis's lenses the remaining
+        40 − 2.63 − 25.4 − 2 × 5.9 leave 0.17 mm between the pair.
+    """
+    if sensor.window is None or sensor.top_to_chip is None:
+        raise ValueError(f"{sensor.name}: a head needs its window, which its data file lacks")
+    first, second = _lenses(pair or telecentric_pair())
+    concave, convex = _lenses(collimator or collimating_pair())
+    between = concave_height - concave_to_pair - pair_height - first.thickness - second.thickness
+    gaps = (
+        concave_to_pair,
+        round(between, 9),  # what floating point adds to 0.17
+        round(pair_height - convex_height - convex.thickness, 9),
+        convex_height,
+    )
+    return OpticalSystem(
+        f"head with {first.part} + {second.part}",
+        (concave, first, second, convex, sensor.window),
+        gaps,
+        round(sensor.top_to_chip - sensor.window.thickness, 9),
+    )
