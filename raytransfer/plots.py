@@ -187,7 +187,7 @@ def plot_focus(
         z = [-20, 0, system.length, system.length + shown, system.length + 1.35 * sensor_dist]
         slope = -exit_height / shown
         ax.plot(z, [entry, height, exit_height, 0, slope * (z[-1] - z[-2])], color=colour)
-    _draw_glass(ax, system, "x", TCD1304)
+    _draw_glass(ax, system, "x", lens_width / 2)
     _draw_sensor(ax, system.length + sensor_dist, lens_width / 2)
     ax.annotate(
         "sensor",
@@ -199,19 +199,27 @@ def plot_focus(
     )
     where = "on the sensor"
     if abs(defocus) > 1e-9:
-        where = f"{abs(defocus):.3f} mm {'behind' if defocus > 0 else 'before'} it"
+        where = f"{abs(defocus):.3f} mm {'behind' if defocus > 0 else 'before'} the sensor"
     drawn = f" (drawn × {magnify:g})" if magnify != 1 else ""
     ax.set_title(
-        f"source at {source_dist / 1000:g} m: focus {where}{drawn},\nbeam {width:.3f} mm wide"
+        f"source at {source_dist / 1000:g} m\nfocus {where}{drawn}\nbeam {width:.3f} mm wide"
     )
     _axis(ax)
     return ax
 
 
-def _outline(placed: Placed, meridian: Meridian, sensor: LineSensor) -> NDArray[np.float64]:
-    """Corners of an element's cross-section, shape (N, 2): z and height in mm."""
+def outline(placed: Placed, meridian: Meridian, window: float) -> NDArray[np.float64]:
+    """Corners of an element's cross-section, shape (82, 2): z and height in mm.
+
+    Parameters
+    ----------
+    placed : Placed
+    meridian : {"x", "y"}
+    window : float
+        Half size in mm of elements that are not lenses.
+    """
     element, front, back = placed
-    half = _half_size(element, meridian, sensor)
+    half = _half_size(element, meridian, window)
     y = np.linspace(half, -half, 41)
     left, right = np.full_like(y, front), np.full_like(y, back)
     if isinstance(element, Lens) and element.bends == meridian:
@@ -220,12 +228,12 @@ def _outline(placed: Placed, meridian: Meridian, sensor: LineSensor) -> NDArray[
     return np.concatenate([np.stack([left, y], 1), np.stack([right, y], 1)[::-1]])
 
 
-def _draw_glass(ax: Axes, system: OpticalSystem, meridian: Meridian, sensor: LineSensor) -> None:
+def _draw_glass(ax: Axes, system: OpticalSystem, meridian: Meridian, window: float) -> None:
     for placed in system.layout():
         bends = isinstance(placed.element, Lens) and placed.element.bends == meridian
         ax.add_patch(
             Polygon(
-                _outline(placed, meridian, sensor),
+                outline(placed, meridian, window),
                 facecolor=GLASS,
                 edgecolor="0.35",
                 alpha=0.7 if bends else 0.35,
@@ -269,8 +277,9 @@ def plot_system(
     sensor : LineSensor
         Drawn to its length, or as a thick point in the other meridian.
     """
+    window = 0.51 * sensor.length  # a little longer than the pixels
     if width is None:
-        width = 2 * _half_size(system.elements[0], meridian, sensor)
+        width = 2 * _half_size(system.elements[0], meridian, window)
     end = system.sensor_distance if sensor_dist is None else sensor_dist
     behind = 20.0 if end is None else end
     lead = 0.35 * (system.length + behind)
@@ -280,7 +289,7 @@ def plot_system(
         z, path = system.trace(np.stack([y, slopes]), meridian, plates=plates)
         start, last = y - lead * slopes, path[-1]
         heights = np.vstack([start, path[:, 0], last[0] + behind * last[1]])
-        half = [_half_size(element, meridian, sensor) for element in system.elements]
+        half = [_half_size(element, meridian, window) for element in system.elements]
         missed = np.abs(path[:, 0]) > np.repeat(half, 2)[:, None] + 1e-9
         gone = np.maximum.accumulate(missed)
         heights[2:][gone] = np.nan  # drawn up to the vertex where it misses
@@ -292,7 +301,7 @@ def plot_system(
             linewidth=0.9,
             label=[label] + [None] * (rays - 1),
         )
-    _draw_glass(ax, system, meridian, sensor)
+    _draw_glass(ax, system, meridian, window)
     if end is not None:
         half_line = sensor.length / 2 if meridian == "x" else 4 * sensor.pixel_height
         _draw_sensor(ax, system.length + end, half_line)
@@ -301,9 +310,9 @@ def plot_system(
     return ax
 
 
-def _half_size(element: Element, meridian: Meridian, sensor: LineSensor) -> float:
+def _half_size(element: Element, meridian: Meridian, window: float) -> float:
     if not isinstance(element, Lens):
-        return 0.51 * sensor.length  # a window is a little longer than its pixels
+        return window
     return (element.height if element.bends == meridian else element.length) / 2
 
 
@@ -474,7 +483,7 @@ def plot_lens_comparison(
             ax.annotate(
                 f"two {row.front}, f = {row.effective_focal_length:.1f} mm",
                 (row.beam_width, row.field_edge / 1000),
-                (-8, 8) if late else (8, 4),
+                (0, 26) if late else (8, 4),
                 textcoords="offset points",
                 ha="right" if late else "left",
                 fontsize=9,

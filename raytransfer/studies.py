@@ -393,7 +393,8 @@ class AreaMap:
     @property
     def count(self) -> NDArray[np.intp]:
         """How many LEDs are seen, shape (H, W)."""
-        return np.count_nonzero(self.visible, axis=0)
+        count: NDArray[np.intp] = self.visible.sum(axis=0)
+        return count
 
     def tracked(self, leds: int = 2) -> NDArray[np.bool_]:
         """Where at least `leds` are seen, shape (H, W)."""

@@ -1,0 +1,232 @@
+"""Notebooks as strict regression tests: what nbval leaves open is closed here.
+
+Every cell's text, LaTeX, tables and streams are compared by nbval. On top of that
+
+* figures are compared by the RMS of their grey levels;
+* what an `Output` widget captured belongs to that widget, not to the cell, and an error that it
+  captured fails the cell;
+* a cell that was never run has nothing to compare with, and fails;
+* after the last cell the widgets themselves are compared with those saved in the notebook, and
+  every control is moved once: a callback that raises fails, wherever its traceback went.
+
+`pytest notebooks/x.ipynb` is all it takes; nbval's own options are not needed.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from nbformat.v4 import new_code_cell
+from nbval.plugin import IPyNbCell, IPyNbFile, NbCellError
+from PIL import Image
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+GREY_RMS = 2.0
+"""Figures that differ by more than this many of 255 grey levels (root mean square) are different."""
+
+WIDGET_STATE = "application/vnd.jupyter.widget-state+json"
+
+MOVE_EVERY_CONTROL = """
+import sys as _sys
+def _move_every_control():
+    if "ipywidgets" not in _sys.modules:
+        return
+    from ipywidgets import widgets as w
+    instances = list(w.widget._instances.values())
+    for control in instances:
+        if getattr(control, "disabled", False) or not hasattr(control, "value"):
+            continue
+        before = control.value
+        if isinstance(control, (w.FloatSlider, w.IntSlider)):
+            step = control.step if before + control.step <= control.max else -control.step
+            after = before + step
+        elif isinstance(control, (w.Checkbox, w.ToggleButton)):
+            after = not before
+        elif isinstance(control, (w.Dropdown, w.RadioButtons, w.Select, w.ToggleButtons)):
+            values = [option[1] for option in control._options_full]
+            after = values[(values.index(before) + 1) % len(values)]
+        elif isinstance(control, (w.FloatText, w.IntText)):
+            after = before + 1
+        else:
+            continue
+        control.value = after
+        control.value = before
+    for control in instances:
+        if isinstance(control, w.Button):
+            control.click()
+_move_every_control()
+"""
+
+
+def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> StrictNotebook | None:
+    """Collect notebooks strictly, whatever nbval was told on the command line."""
+    if file_path.suffix != ".ipynb":
+        return None
+    parent.config.option.nbval = parent.config.option.nbval_lax = False
+    notebook: StrictNotebook = StrictNotebook.from_parent(parent, path=file_path)
+    return notebook
+
+
+def grey_rms(one: bytes, other: bytes) -> float:
+    """Root mean square difference in grey levels; infinite for pictures of different size."""
+    a, b = (
+        np.asarray(Image.open(io.BytesIO(png)).convert("L"), dtype=float) for png in (one, other)
+    )
+    return float(np.sqrt(np.mean((a - b) ** 2))) if a.shape == b.shape else np.inf
+
+
+class StrictNotebook(IPyNbFile):  # type: ignore[misc]
+    """A notebook whose cells are compared strictly and whose widgets are watched."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.compare_outputs = True
+        self.models: dict[str, dict[str, Any]] = {}
+        """State of the running notebook's widgets by model id."""
+
+    def collect(self) -> Iterator[pytest.Item]:
+        """Yield the cells, then two checks of the widgets."""
+        cells = list(super().collect())
+        for item in cells:
+            yield StrictCell.from_parent(
+                self, name=item.name, cell_num=item.cell_num, cell=item.cell, options=item.options
+            )
+        yield Widgets.from_parent(self, name="widgets are as saved")
+        yield StrictCell.from_parent(
+            self,
+            name="every control moves",
+            cell_num=len(cells),
+            cell=new_code_cell(MOVE_EVERY_CONTROL, execution_count=0),
+            options={"check": True, "skip": False, "check_exception": False},
+        )
+
+    def get_kernel_message(self, timeout: float | None = None, stream: str = "iopub") -> Any:
+        """Return the next message that belongs to a cell; what belongs to widgets is kept here."""
+        while True:
+            message = super().get_kernel_message(timeout, stream)
+            kind, content = message["msg_type"], message["content"]
+            if kind == "comm_open" and content.get("target_name") == "jupyter.widget":
+                self.models[content["comm_id"]] = {}
+            if kind in ("comm_open", "comm_msg") and content["comm_id"] in self.models:
+                self._update(content["comm_id"], content["data"], message.get("buffers", ()))
+            model = self._captured_by(message)
+            if model is None or kind == "error":
+                return message
+            if kind == "clear_output":
+                model["outputs"] = []
+            elif kind in ("stream", "display_data", "execute_result"):
+                model.setdefault("outputs", []).append({"output_type": kind, **content})
+            else:
+                return message
+
+    def _update(self, comm_id: str, data: dict[str, Any], buffers: Any) -> None:
+        if "state" in data:
+            self.models[comm_id].update(data["state"])
+            for path, buffer in zip(data.get("buffer_paths", ()), buffers, strict=True):
+                self.models[comm_id][path[0]] = bytes(buffer)
+
+    def _captured_by(self, message: dict[str, Any]) -> dict[str, Any] | None:
+        """Return the Output widget that holds the cell's output at the moment, if there is one."""
+        parent = message["parent_header"].get("msg_id")
+        for model in self.models.values():
+            if model.get("_model_name") == "OutputModel" and model.get("msg_id") == parent:
+                return model
+        return None
+
+
+class StrictCell(IPyNbCell):  # type: ignore[misc]
+    """A cell whose figures are compared too."""
+
+    def runtest(self) -> None:
+        """Refuse a cell that was saved without having run; nbval would pass it unchecked."""
+        if self.cell.execution_count is None and self.cell.source.strip():
+            self.raise_cell_error("This cell was saved without having run")
+        super().runtest()
+
+    def compare_outputs(self, test: Any, ref: Any, skip_compare: Any = None) -> bool:
+        """Compare text as nbval does, then the pictures."""
+        if not super().compare_outputs(test, ref, skip_compare):
+            return False
+        new, saved = ([_png(out) for out in outs if _png(out)] for outs in (test, ref))
+        if len(new) != len(saved):
+            self.comparison_traceback.append(f"{len(saved)} figures saved, {len(new)} drawn")
+            return False
+        for number, (one, other) in enumerate(zip(new, saved, strict=True), start=1):
+            if (rms := grey_rms(one, other)) > GREY_RMS:
+                self.comparison_traceback.append(
+                    f"figure {number} differs: RMS of grey levels {rms:.2f} > {GREY_RMS}"
+                )
+                return False
+        return True
+
+
+class Widgets(pytest.Item):
+    """The widgets of a notebook against those it was saved with."""
+
+    def runtest(self) -> None:
+        """Compare states as text, pictures by their grey levels."""
+        widgets = self.parent.nb.metadata.get("widgets")
+        if not widgets:
+            return  # saved without widget state, as JupyterLab does unless told otherwise
+        saved = [_saved_state(entry) for entry in widgets[WIDGET_STATE]["state"].values()]
+        saved_texts, saved_pictures = _split(saved)
+        new_texts, new_pictures = _split(list(self.parent.models.values()))
+        if saved_texts != new_texts:
+            gone = [text for text in saved_texts if text not in new_texts]
+            come = [text for text in new_texts if text not in saved_texts]
+            message = ["saved, but not so now:", *gone, "now, but not saved:", *come]
+            raise NbCellError(0, "Widgets differ", "\n".join(message))
+        for picture in saved_pictures:
+            best = min((grey_rms(picture, other) for other in new_pictures), default=np.inf)
+            if best > GREY_RMS:
+                raise NbCellError(
+                    0, "A widget's picture differs", f"RMS of grey levels {best:.2f} > {GREY_RMS}"
+                )
+
+    def repr_failure(self, excinfo: Any, style: Any = None) -> Any:
+        """Show what differs, without a traceback of this file."""
+        if isinstance(excinfo.value, NbCellError):
+            return f"{excinfo.value}\n{excinfo.value.source}"
+        return super().repr_failure(excinfo, style)
+
+    def reportinfo(self) -> tuple[Path, int, str]:
+        """Name the notebook."""
+        return self.path, 0, f"{self.path.name}: {self.name}"
+
+
+def _png(output: Any) -> bytes | None:
+    data = output.get("data", {}).get("image/png")
+    return base64.b64decode(data) if data else None
+
+
+def _saved_state(entry: dict[str, Any]) -> dict[str, Any]:
+    """Return a saved widget's state, with its buffers in it as bytes."""
+    state = {"_model_name": entry["model_name"], **entry["state"]}
+    for buffer in entry.get("buffers", ()):
+        state[buffer["path"][0]] = base64.b64decode(buffer["data"])
+    return state
+
+
+def _split(models: list[dict[str, Any]]) -> tuple[list[str], list[bytes]]:
+    """Return the states of widgets as text without random ids, and their pictures."""
+    texts, pictures = [], []
+    for model in models:
+        shown = {}
+        for key, value in sorted(model.items()):
+            if isinstance(value, bytes):
+                pictures.append(value)
+            elif key == "outputs":
+                shown[key] = "".join(str(out.get("text", out.get("data"))) for out in value)
+            elif not key.startswith("_") and key not in ("layout", "style", "msg_id", "children"):
+                shown[key] = value
+        if shown:
+            texts.append(f"{model.get('_model_name')} {json.dumps(shown, sort_keys=True)}")
+    return sorted(texts), pictures

@@ -1,0 +1,376 @@
+"""An interactive look at a pair of lenses: move a slider, see what the sensor sees.
+
+    from raytransfer.explorer import Explorer
+    Explorer()
+
+as the last line of a notebook cell. What is shown is paraxial.
+"""
+
+from __future__ import annotations
+
+import html
+import math
+import struct
+import traceback
+import zlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import ipywidgets as widgets
+import matplotlib as mpl
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+
+from raytransfer import plots
+from raytransfer.casting import cast_rays
+from raytransfer.lenses import CATALOGUE, THESIS_LENSES, Lens
+from raytransfer.sensors import TCD1304, LineSensor
+from raytransfer.studies import (
+    FAR,
+    beam_width,
+    field_edge,
+    image_position,
+    lateral_resolution,
+    tracking_start,
+)
+from raytransfer.systems import OpticalSystem, telecentric_pair
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from raytransfer.matrices import RayMatrix
+
+_ROOM_WIDTH = 3000.0
+_ROOM_DEPTH = 6000.0
+_LEAD = 30.0  # mm of incoming rays drawn in front of the lenses
+
+
+@dataclass(frozen=True)
+class View:
+    """What one setting of the sliders gives; lengths in mm."""
+
+    system: OpticalSystem
+    matrix: RayMatrix
+    aperture: float
+    sensor: LineSensor
+    sensor_dist: float
+    source_dist: float
+    axis_off: float
+    led_spacing: float
+
+    @property
+    def half_length(self) -> float:
+        """Half the length of the pixel line."""
+        return self.sensor.length / 2
+
+    @property
+    def field_edge(self) -> float:
+        """Largest offset that is seen at the distance of the source."""
+        return float(field_edge(self.matrix, self.source_dist, self.half_length, self.sensor_dist))
+
+    @property
+    def tracking_start(self) -> float:
+        """Distance from which on two LEDs are seen wherever the tracker is."""
+        return float(
+            tracking_start(self.matrix, self.led_spacing, self.half_length, self.sensor_dist)
+        )
+
+    @property
+    def leds(self) -> NDArray[np.float64]:
+        """Room x of the LEDs of a long line, one of them, the source, at 0."""
+        reach = math.floor(_ROOM_WIDTH / self.led_spacing)
+        leds: NDArray[np.float64] = np.arange(-reach, reach + 1) * self.led_spacing
+        return leds
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """Which of the LEDs are seen by the tracker, which stands at x = axis_off."""
+        return np.abs(self.leds - self.axis_off) <= self.field_edge
+
+    def results(self) -> dict[str, str]:
+        """Quantities with their values and units, as text."""
+        setting = (self.matrix, self.source_dist)
+        focus = cast_rays(self.aperture, *setting, self.axis_off).focal_length
+        position = image_position(*setting, self.axis_off, self.sensor_dist)
+        width = beam_width(self.aperture, *setting, self.sensor_dist)
+        pixel = lateral_resolution(*setting, self.sensor.pitch, self.sensor_dist)
+        where = f"pixel {float(self.sensor.pixel(position)):.1f}"
+        if abs(position) > self.half_length:
+            where = "off the sensor"
+        return {
+            "focus of this source": f"{focus:.3f} mm behind the lenses",
+            "sensor": f"{self.sensor_dist:.3f} mm behind the lenses",
+            "image": f"{position:.3f} mm, {where}",
+            "beam width": f"{width:.3f} mm, {width / self.sensor.pitch:.0f} px",
+            "field edge here": f"{self.field_edge:.0f} mm",
+            "one pixel here": f"{pixel:.3f} mm",
+            "tracking starts at": f"{self.tracking_start:.0f} mm",
+            "LEDs seen": f"{self.seen.sum()}",
+        }
+
+
+class Explorer(widgets.VBox):  # type: ignore[misc]
+    """Sliders over a picture of the lenses and of the room.
+
+    An exception while redrawing is shown below the picture, with its traceback, and raised again:
+    a cell that moves a slider fails, and nothing vanishes when a person does.
+
+    Parameters
+    ----------
+    front, back : str
+        Lenses by their names in `CATALOGUE` or `THESIS_LENSES`.
+    gap : float
+        Air between the curved sides, mm.
+    sensor_dist : float, optional
+        From the last vertex to the sensor, mm; left out, it follows the focus of a source 5 m away.
+    source_dist, axis_off : float
+        Where the source is, along and from the axis, mm.
+    led_spacing : float
+        mm.
+    sensor : LineSensor
+    """
+
+    def __init__(
+        self,
+        front: str = "PCX_30_32_60",
+        back: str = "PCX_30_32_60",
+        *,
+        gap: float = 0.0,
+        sensor_dist: float | None = None,
+        source_dist: float = 2000.0,
+        axis_off: float = 300.0,
+        led_spacing: float = 500.0,
+        sensor: LineSensor = TCD1304,
+    ) -> None:
+        self._sensor = sensor
+        names = [
+            name
+            for name, lens in {**THESIS_LENSES, **CATALOGUE}.items()
+            if lens.radius > 0 and lens.height >= sensor.length
+        ]
+        self.front = widgets.Dropdown(options=names, value=front, description="front lens")
+        self.back = widgets.Dropdown(options=names, value=back, description="back lens")
+        self.gap = _slider("gap", "mm", gap, 0, 10, 0.1)
+        self.focus = widgets.Checkbox(
+            value=sensor_dist is None, description="sensor in the focus of 5 m", indent=False
+        )
+        self.sensor_dist = _slider("sensor", "mm", sensor_dist or 26, 5, 520, 0.05)
+        self.source_dist = _slider("source", "mm", source_dist, 200, _ROOM_DEPTH, 10)
+        self.axis_off = _slider("offset", "mm", axis_off, -_ROOM_WIDTH, _ROOM_WIDTH, 10)
+        self.led_spacing = _slider("LED spacing", "mm", led_spacing, 100, 2000, 10)
+        self.picture = widgets.Image(format="png")
+        self.readout = widgets.HTML()
+        self.error = widgets.HTML()
+        self._inputs = (
+            self.front,
+            self.back,
+            self.gap,
+            self.focus,
+            self.sensor_dist,
+            self.source_dist,
+            self.axis_off,
+            self.led_spacing,
+        )
+        self._drawing = _Drawing(sensor)
+        self._redraw()
+        for control in self._inputs:
+            control.observe(self._changed, names="value")
+        super().__init__(
+            [
+                widgets.HBox(
+                    [
+                        widgets.VBox([self.front, self.back, self.gap, self.focus]),
+                        widgets.VBox(
+                            [self.source_dist, self.axis_off, self.led_spacing, self.sensor_dist]
+                        ),
+                    ]
+                ),
+                self.picture,
+                self.readout,
+                self.error,
+            ]
+        )
+
+    def view(self) -> View:
+        """What the sliders, as they are, show."""
+        system = telecentric_pair(self.front.value, self.back.value, self.gap.value)
+        first, second = (lens for lens in system.elements if isinstance(lens, Lens))
+        matrix = system.matrix("x")
+        sensor_dist = self.sensor_dist.value
+        if self.focus.value:
+            sensor_dist = cast_rays(1, matrix, FAR, 0).focal_length
+        return View(
+            system,
+            matrix,
+            min(first.height, second.height),
+            self._sensor,
+            sensor_dist,
+            self.source_dist.value,
+            self.axis_off.value,
+            self.led_spacing.value,
+        )
+
+    def _changed(self, change: dict[str, Any]) -> None:
+        if change["owner"] is self.sensor_dist and self.focus.value:
+            return  # moved by _redraw itself
+        try:
+            self._redraw()
+        except Exception:
+            self.error.value = (
+                f'<pre style="color:#b00020;line-height:1.2">{html.escape(traceback.format_exc())}'
+                "</pre>"
+            )
+            raise
+        self.error.value = ""
+
+    def _redraw(self) -> None:
+        view = self.view()
+        self.sensor_dist.disabled = self.focus.value
+        self.sensor_dist.value = view.sensor_dist
+        self.picture.value = self._drawing.png(view)
+        self.readout.value = _table(view.results())
+
+
+def _slider(label: str, unit: str, value: float, low: float, high: float, step: float) -> Any:
+    return widgets.FloatSlider(
+        value=value,
+        min=low,
+        max=high,
+        step=step,
+        description=f"{label} ({unit})",
+        readout_format=".2f" if step < 0.1 else ".1f" if step < 1 else ".0f",
+        style={"description_width": "110px"},
+        layout={"width": "430px"},
+    )
+
+
+def _table(results: dict[str, str]) -> str:
+    cell = '<td style="padding:0 1.5em 0 0;{}">{}</td>'
+    items = list(results.items())
+    rows = (items[row::4] for row in range(4))
+    body = "".join(
+        "<tr>"
+        + "".join(cell.format("color:#666", k) + cell.format("font-weight:600", v) for k, v in row)
+        + "</tr>"
+        for row in rows
+    )
+    return f"<table>{body}</table>"
+
+
+class _Drawing:
+    """The picture: a background drawn rarely, and artists blitted over it at every move."""
+
+    def __init__(self, sensor: LineSensor) -> None:
+        with mpl.rc_context():
+            plots.style()
+            self._figure = Figure(figsize=(9.6, 4.0), dpi=100)
+            self._canvas = FigureCanvasAgg(self._figure)
+            self._optics, self._room = self._figure.subplots(1, 2, width_ratios=(1.5, 1))
+            optics, room = self._optics, self._room
+            optics.set(
+                title="rays along the pixel line (paraxial)",
+                xlabel="along the axis from the first surface (mm)",
+                ylabel="height (mm)",
+                ylim=(-22, 22),
+            )
+            room.set(
+                title="room from above; shaded: no gaps",
+                xlabel="x (m)",
+                ylabel="y from the LEDs (m)",
+                aspect="equal",
+                xlim=(-_ROOM_WIDTH / 1000, _ROOM_WIDTH / 1000),
+                ylim=(-0.25, _ROOM_DEPTH / 1000),
+            )
+            half = sensor.length / 2
+            # in the order in which they are painted
+            self._tracked = room.axhspan(0, 1, facecolor="#deebf7")
+            self._field = room.add_patch(Polygon(np.zeros((3, 2)), facecolor="#9ecae1", alpha=0.8))
+            (self._all_leds,) = room.plot(
+                [], [], "o", color="w", markeredgecolor="0.4", markersize=5
+            )
+            (self._seen_leds,) = room.plot([], [], "o", color=plots.LED, markersize=6)
+            (self._ray,) = room.plot([], [], color=plots.RAYS[0], linewidth=1)
+            (self._tracker,) = room.plot([], [], "v", color="k", markersize=8)
+            self._lenses = [
+                optics.add_patch(Polygon(np.zeros((3, 2)), facecolor=plots.GLASS, edgecolor="0.35"))
+                for _ in range(2)
+            ]
+            self._rays = [optics.plot([], [], color=colour)[0] for colour in plots.RAYS]
+            (self._line,) = optics.plot([], [], color=plots.SENSOR, linewidth=4)
+            self._line.set_ydata([-half, half])
+            self._half = half
+        self._moving = {
+            room: [
+                self._tracked,
+                self._field,
+                self._ray,
+                self._all_leds,
+                self._seen_leds,
+                self._tracker,
+            ],
+            optics: [*self._lenses, *self._rays, self._line],
+        }
+        for artists in self._moving.values():
+            for artist in artists:
+                artist.set_animated(True)
+        self._reach = 0.0
+        self._background: Any = None
+
+    def png(self, view: View) -> bytes:
+        """Return the picture of a view."""
+        system, source_dist, axis_off = view.system, view.source_dist, view.axis_off
+        self._fit(system.length + 1.3 * view.sensor_dist)
+        for patch, placed in zip(self._lenses, system.layout(), strict=True):
+            patch.set_xy(plots.outline(placed, "x", view.half_length))
+        z, heights = plots.ray_paths(
+            view.aperture,
+            system.length,
+            view.matrix,
+            source_dist,
+            axis_off,
+            1.25 * view.sensor_dist,
+        )
+        for line, ray in zip(self._rays, heights.T, strict=True):
+            line.set_data(z, ray)
+        self._line.set_xdata([system.length + view.sensor_dist] * 2)
+
+        # the part of the line of LEDs that the tracker sees
+        left, right = axis_off - view.field_edge, axis_off + view.field_edge
+        self._field.set_xy(np.array([[axis_off, source_dist], [left, 0], [right, 0]]) / 1000)
+        start = min(view.tracking_start, _ROOM_DEPTH)
+        self._tracked.set_y(start / 1000)
+        self._tracked.set_height((_ROOM_DEPTH - start) / 1000)
+        self._ray.set_data([0, axis_off / 1000], [0, source_dist / 1000])
+        self._all_leds.set_data(view.leds / 1000, 0 * view.leds)
+        seen = view.leds[view.seen]
+        self._seen_leds.set_data(seen / 1000, 0 * seen)
+        self._tracker.set_data([axis_off / 1000], [source_dist / 1000])
+
+        self._canvas.restore_region(self._background)
+        for axes, artists in self._moving.items():
+            for artist in artists:
+                axes.draw_artist(artist)
+        return _png(np.asarray(self._canvas.buffer_rgba())[..., :3])
+
+    def _fit(self, reach: float) -> None:
+        """Draw the background anew where the optics do not fit its axes, or use little of them."""
+        if self._background is None or not 0.6 * self._reach <= reach <= self._reach:
+            self._reach = 20 * math.ceil(1.2 * reach / 20)
+            self._optics.set_xlim(-_LEAD, self._reach)
+            self._canvas.draw()
+            self._background = self._canvas.copy_from_bbox(self._figure.bbox)
+
+
+def _png(pixels: NDArray[np.uint8]) -> bytes:
+    """Encode (H, W, 3) pixels as PNG with the cheapest filter: a quarter of Pillow's time."""
+    height, width, _ = pixels.shape
+    rows = np.zeros((height, 1 + 3 * width), np.uint8)  # each row begins with its filter, none
+    rows[:, 1:] = pixels.reshape(height, -1)
+    header = struct.pack(">2I5B", width, height, 8, 2, 0, 0, 0)
+    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(rows.tobytes(), 1)), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in chunks
+    )
