@@ -23,7 +23,6 @@ define install
 	  f"linetrack needs Python 3.11, 3.12 or 3.13; $(PYTHON) is {v[0]}.{v[1]}. Try: make PYTHON=python3.11 ...")'
 	@$(PYTHON) -c 'import ensurepip' 2>/dev/null || \
 	  { echo "Python lacks venv: apt install python3-venv"; exit 1; }
-	@rm -rf $(1)
 	$(PYTHON) -m venv $(1)
 	@if $(1)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt uv; then \
 	  echo "uv pip install $(2)"; \

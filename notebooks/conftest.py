@@ -5,6 +5,7 @@ Every cell's text, LaTeX, tables and streams are compared by nbval. On top of th
 * figures are compared by the RMS of their grey levels;
 * what an `Output` widget captured belongs to that widget, not to the cell, and an error that it
   captured fails the cell;
+* a closing semicolon silences a cell, as it does in a notebook;
 * a cell that was never run has nothing to compare with, and fails;
 * after the last cell the widgets themselves are compared with those saved in the notebook, and
   every control is moved once: a callback that raises fails, wherever its traceback went.
@@ -17,6 +18,9 @@ from __future__ import annotations
 import base64
 import io
 import json
+import shutil
+import tempfile
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,6 +37,9 @@ GREY_RMS = 2.0
 """Figures that differ by more than this many of 255 grey levels (root mean square) are different."""
 
 WIDGET_STATE = "application/vnd.jupyter.widget-state+json"
+
+NOT_COMPARED = ("children", "layout", "msg_id", "style")
+"""What a widget's state holds of random ids."""
 
 MOVE_EVERY_CONTROL = """
 import sys as _sys
@@ -108,6 +115,24 @@ class StrictNotebook(IPyNbFile):  # type: ignore[misc]
             options={"check": True, "skip": False, "check_exception": False},
         )
 
+    def setup(self) -> None:
+        """Start the kernel with a profile of its own, and run cells as a notebook does.
+
+        nbval keeps cells out of the history, and without it a closing semicolon silences nothing.
+        """
+        self._profile = tempfile.mkdtemp(prefix="ipython-")
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("IPYTHONDIR", self._profile)
+            super().setup()
+        self.kernel.execute_cell_input = partial(
+            self.kernel.kc.execute, store_history=True, stop_on_error=False
+        )
+
+    def teardown(self) -> None:
+        """Stop the kernel and remove its profile."""
+        super().teardown()
+        shutil.rmtree(self._profile, ignore_errors=True)
+
     def get_kernel_message(self, timeout: float | None = None, stream: str = "iopub") -> Any:
         """Return the next message that belongs to a cell; what belongs to widgets is kept here."""
         while True:
@@ -155,7 +180,7 @@ class StrictCell(IPyNbCell):  # type: ignore[misc]
         """Compare text as nbval does, then the pictures."""
         if not super().compare_outputs(test, ref, skip_compare):
             return False
-        new, saved = ([_png(out) for out in outs if _png(out)] for outs in (test, ref))
+        new, saved = ([png for out in outs if (png := _png(out))] for outs in (test, ref))
         if len(new) != len(saved):
             self.comparison_traceback.append(f"{len(saved)} figures saved, {len(new)} drawn")
             return False
@@ -170,6 +195,8 @@ class StrictCell(IPyNbCell):  # type: ignore[misc]
 
 class Widgets(pytest.Item):
     """The widgets of a notebook against those it was saved with."""
+
+    parent: StrictNotebook
 
     def runtest(self) -> None:
         """Compare states as text, pictures by their grey levels."""
@@ -225,7 +252,7 @@ def _split(models: list[dict[str, Any]]) -> tuple[list[str], list[bytes]]:
                 pictures.append(value)
             elif key == "outputs":
                 shown[key] = "".join(str(out.get("text", out.get("data"))) for out in value)
-            elif not key.startswith("_") and key not in ("layout", "style", "msg_id", "children"):
+            elif not key.startswith("_") and key not in NOT_COMPARED and value is not None:
                 shown[key] = value
         if shown:
             texts.append(f"{model.get('_model_name')} {json.dumps(shown, sort_keys=True)}")

@@ -70,12 +70,13 @@ def _renumbered(text: str, model_ids: list[str]) -> str:
     """Replace the random ids of widgets by numbers in the order of their creation."""
     for number, model_id in enumerate(model_ids, start=1):
         text = text.replace(model_id, f"{number:032x}")
-    return nbformat.writes(nbformat.reads(text, as_version=4)) + "\n"  # sorted by the new ids
+    in_new_order: str = nbformat.writes(nbformat.reads(text, as_version=4))
+    return in_new_order + "\n"
 
 
 def main() -> int:
     """Run the command."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])  # type: ignore[union-attr]
+    parser = argparse.ArgumentParser(description="Execute notebooks in place.")
     parser.add_argument("notebooks", nargs="*", type=Path, metavar="NOTEBOOK")
     parser.add_argument(
         "--check", action="store_true", help="write nothing; fail if a notebook would change"

@@ -88,8 +88,9 @@ def cast_rays(lens_width: Any, lens_mat: Any, source_dist: Any, axis_off: Any) -
         focal_length = np.where(parallel, np.inf, focal_length)
         at_infinity = np.where(off == 0, 0.0, np.copysign(np.inf, c * off))
         focal_offset = np.where(parallel, at_infinity, focal_offset)
+    focal_offset = focal_offset + 0.0  # no −0.0 on the axis
     if np.ndim(focal_offset) == 0:
-        return Focus(float(focal_length), float(focal_offset) + 0.0)  # no −0.0
+        return Focus(float(focal_length), float(focal_offset))
     if focal_length.shape != focal_offset.shape:
         focal_length = np.broadcast_to(focal_length, focal_offset.shape).copy()
     return Focus(focal_length, focal_offset)

@@ -81,8 +81,7 @@ class View:
     def leds(self) -> NDArray[np.float64]:
         """Room x of the LEDs of a long line, one of them, the source, at 0."""
         reach = math.floor(_ROOM_WIDTH / self.led_spacing)
-        leds: NDArray[np.float64] = np.arange(-reach, reach + 1) * self.led_spacing
-        return leds
+        return np.arange(-reach, reach + 1) * np.float64(self.led_spacing)
 
     @property
     def seen(self) -> NDArray[np.bool_]:
@@ -234,6 +233,8 @@ class Explorer(widgets.VBox):  # type: ignore[misc]
 
 
 def _slider(label: str, unit: str, value: float, low: float, high: float, step: float) -> Any:
+    if not low <= value <= high:  # a slider would silently move it to its end
+        raise ValueError(f"{label} = {value:g} {unit}: the explorer goes from {low:g} to {high:g}")
     return widgets.FloatSlider(
         value=value,
         min=low,
@@ -241,8 +242,8 @@ def _slider(label: str, unit: str, value: float, low: float, high: float, step: 
         step=step,
         description=f"{label} ({unit})",
         readout_format=".2f" if step < 0.1 else ".1f" if step < 1 else ".0f",
-        style={"description_width": "110px"},
-        layout={"width": "430px"},
+        style={"description_width": "130px"},
+        layout={"width": "450px"},
     )
 
 

@@ -200,9 +200,9 @@ def plot_focus(
     where = "on the sensor"
     if abs(defocus) > 1e-9:
         where = f"{abs(defocus):.3f} mm {'behind' if defocus > 0 else 'before'} the sensor"
-    drawn = f" (drawn × {magnify:g})" if magnify != 1 else ""
+    drawn = f", drawn × {magnify:g}" if magnify != 1 else ""
     ax.set_title(
-        f"source at {source_dist / 1000:g} m\nfocus {where}{drawn}\nbeam {width:.3f} mm wide"
+        f"source at {source_dist / 1000:g} m{drawn}\nfocus {where}\nbeam {width:.3f} mm wide"
     )
     _axis(ax)
     return ax

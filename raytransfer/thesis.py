@@ -272,6 +272,6 @@ def _reproduce() -> list[Claim]:
             "25.4",
             focus_far - COVER,
             "focus less 0.7 mm, as computed there; but 0.7 mm is the glass, and the chip is "
-            f" {TCD1304.top_to_chip:g} mm below its top",
+            f"{TCD1304.top_to_chip:g} mm below its top",
         ),
     ]
