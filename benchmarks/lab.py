@@ -52,6 +52,7 @@ class Lab:
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             self._url = f"http://127.0.0.1:{probe.getsockname()[1]}"
+        self._log = (self._settings / "log").open("w", encoding="utf-8")
         self._server = subprocess.Popen(
             [
                 sys.executable,
@@ -64,7 +65,7 @@ class Lab:
             ],
             env={**os.environ, **self._private_settings()},
             stdout=subprocess.DEVNULL,
-            stderr=(self._settings / "log").open("w"),
+            stderr=self._log,
         )
         self._playwright = sync_playwright().start()
         try:
@@ -82,6 +83,7 @@ class Lab:
         self._playwright.stop()
         self._server.terminate()
         self._server.wait(timeout=30)
+        self._log.close()
         shutil.rmtree(self._settings, ignore_errors=True)
 
     def run_all(self, notebook: str) -> None:

@@ -172,7 +172,7 @@ class Explorer(widgets.VBox):  # type: ignore[misc]
             self.axis_off,
             self.led_spacing,
         )
-        self._drawing = _Drawing(sensor)
+        self._drawing = Drawing(sensor)
         self._redraw()
         for control in self._inputs:
             control.observe(self._changed, names="value")
@@ -260,15 +260,15 @@ def _table(results: dict[str, str]) -> str:
     return f"<table>{body}</table>"
 
 
-class _Drawing:
+class Drawing:
     """The picture: a background drawn rarely, and artists blitted over it at every move."""
 
     def __init__(self, sensor: LineSensor) -> None:
         with mpl.rc_context():
             plots.style()
-            self._figure = Figure(figsize=(9.6, 4.0), dpi=100)
-            self._canvas = FigureCanvasAgg(self._figure)
-            self._optics, self._room = self._figure.subplots(1, 2, width_ratios=(1.5, 1))
+            self.figure = Figure(figsize=(9.6, 4.0), dpi=100)
+            self._canvas = FigureCanvasAgg(self.figure)
+            self._optics, self._room = self.figure.subplots(1, 2, width_ratios=(1.5, 1))
             optics, room = self._optics, self._room
             optics.set(
                 title="rays along the pixel line (paraxial)",
@@ -302,7 +302,7 @@ class _Drawing:
             (self._line,) = optics.plot([], [], color=plots.SENSOR, linewidth=4)
             self._line.set_ydata([-half, half])
             self._half = half
-        self._moving = {
+        self.moving = {
             room: [
                 self._tracked,
                 self._field,
@@ -313,14 +313,14 @@ class _Drawing:
             ],
             optics: [*self._lenses, *self._rays, self._line],
         }
-        for artists in self._moving.values():
+        for artists in self.moving.values():
             for artist in artists:
                 artist.set_animated(True)
         self._reach = 0.0
         self._background: Any = None
 
-    def png(self, view: View) -> bytes:
-        """Return the picture of a view."""
+    def place(self, view: View) -> None:
+        """Put all artists where the view has them."""
         system, source_dist, axis_off = view.system, view.source_dist, view.axis_off
         self._fit(system.length + 1.3 * view.sensor_dist)
         for patch, placed in zip(self._lenses, system.layout(), strict=True):
@@ -349,8 +349,11 @@ class _Drawing:
         self._seen_leds.set_data(seen / 1000, 0 * seen)
         self._tracker.set_data([axis_off / 1000], [source_dist / 1000])
 
+    def png(self, view: View) -> bytes:
+        """Return the picture of a view: the background, and the artists over it."""
+        self.place(view)
         self._canvas.restore_region(self._background)
-        for axes, artists in self._moving.items():
+        for axes, artists in self.moving.items():
             for artist in artists:
                 axes.draw_artist(artist)
         return _png(np.asarray(self._canvas.buffer_rgba())[..., :3])
@@ -361,7 +364,7 @@ class _Drawing:
             self._reach = 20 * math.ceil(1.2 * reach / 20)
             self._optics.set_xlim(-_LEAD, self._reach)
             self._canvas.draw()
-            self._background = self._canvas.copy_from_bbox(self._figure.bbox)
+            self._background = self._canvas.copy_from_bbox(self.figure.bbox)
 
 
 def _png(pixels: NDArray[np.uint8]) -> bytes:

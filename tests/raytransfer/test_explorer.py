@@ -1,0 +1,302 @@
+"""The explorer: its numbers, its picture, and what happens when something goes wrong."""
+
+from __future__ import annotations
+
+import html
+import io
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+from PIL import Image
+
+from raytransfer import SENSORS, TCD1304, LineSensor, cast_rays, telecentric_pair
+from raytransfer.explorer import Explorer
+from raytransfer.studies import (
+    beam_width,
+    field_edge,
+    image_position,
+    lateral_resolution,
+    tracking_area,
+    tracking_start,
+)
+
+HALF = TCD1304.length / 2
+SETTINGS: dict[str, Any] = {
+    "front": "LJ1430L1",
+    "back": "LJ1567L1",
+    "gap": 2.0,
+    "sensor_dist": 33.0,
+    "source_dist": 1500.0,
+    "axis_off": -200.0,
+    "led_spacing": 300.0,
+}
+
+
+@pytest.fixture(scope="module")
+def shared() -> Explorer:
+    """One explorer for tests that set it up themselves."""
+    return Explorer()
+
+
+def pixels(explorer: Explorer) -> np.ndarray[Any, Any]:
+    return np.asarray(Image.open(io.BytesIO(explorer.picture.value)))
+
+
+# --- numbers --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sensor_dist", [None, 33.0])
+@pytest.mark.parametrize(("source_dist", "axis_off"), [(1500.0, -200.0), (5000.0, 2900.0)])
+def test_results_are_the_studies(
+    sensor_dist: float | None, source_dist: float, axis_off: float
+) -> None:
+    changed = {"sensor_dist": sensor_dist, "source_dist": source_dist, "axis_off": axis_off}
+    explorer = Explorer(**{**SETTINGS, **changed})
+    matrix = telecentric_pair("LJ1430L1", "LJ1567L1", 2.0).matrix("x")
+    chip = cast_rays(1, matrix, 5000, 0).focal_length if sensor_dist is None else sensor_dist
+    width = beam_width(30, matrix, source_dist, chip)
+    edge = field_edge(matrix, source_dist, HALF, chip)
+    position = image_position(matrix, source_dist, axis_off, chip)
+    pixel = position / 0.008 + 1823.5
+    where = f"pixel {pixel:.1f}" if abs(position) <= HALF else "off the sensor"
+    leds = 300 * np.arange(-10, 11)
+    expected = {
+        "focus of this source": f"{cast_rays(30, matrix, source_dist, 0).focal_length:.3f} mm "
+        "behind the lenses",
+        "sensor": f"{chip:.3f} mm behind the lenses",
+        "image": f"{position:.3f} mm, {where}",
+        "beam width": f"{width:.3f} mm, {width / 0.008:.0f} px",
+        "field edge here": f"{edge:.0f} mm",
+        "one pixel here": f"{lateral_resolution(matrix, source_dist, 0.008, chip):.3f} mm",
+        "tracking starts at": f"{tracking_start(matrix, 300, HALF, chip):.0f} mm",
+        "LEDs seen": f"{np.sum(np.abs(leds - axis_off) <= edge)}",
+    }
+    assert explorer.view().results() == expected
+    shown = html.unescape(explorer.readout.value)
+    for quantity, value in expected.items():
+        assert quantity in shown
+        assert value in shown
+    assert (where == "off the sensor") == (axis_off == 2900)
+
+
+def test_the_leds_that_are_seen_are_those_of_the_tracking_area(shared: Explorer) -> None:
+    for axis_off in (-700.0, 0.0, 130.0):
+        shared.axis_off.value = axis_off
+        view = shared.view()
+        area = tracking_area(
+            view.matrix, view.leds, [axis_off], [view.source_dist], sensor_dist=view.sensor_dist
+        )
+        assert_array_equal(view.seen, area.visible[:, 0, 0])
+        assert 0 < view.seen.sum() < view.seen.size
+        assert 0 in view.leds  # the source
+
+
+def test_another_sensor() -> None:
+    small = LineSensor("small", pixels=1000, pitch=0.01, pixel_height=0.1)
+    explorer = Explorer("PCX_15_30_20", "PCX_15_30_20", axis_off=100.0, sensor=small)
+    view = explorer.view()
+    assert view.half_length == 5.0
+    assert view.field_edge == field_edge(view.matrix, 2000, 5.0, view.sensor_dist)
+    position = image_position(view.matrix, 2000, 100, view.sensor_dist)
+    assert view.results()["image"] == f"{position:.3f} mm, pixel {position / 0.01 + 499.5:.1f}"
+
+
+def test_a_sensor_longer_than_all_lenses_is_refused() -> None:
+    with pytest.raises(ValueError, match="TCD1703"):
+        Explorer(sensor=SENSORS["TCD1703"])
+
+
+def test_lenses_lower_than_the_sensor_is_long_are_not_offered(shared: Explorer) -> None:
+    names = set(shared.front.options)
+    assert names == set(shared.back.options)
+    assert {"PCX_30_32_60", "LJ1430L1", "LJ1516L1"} < names
+    assert not names & {"LJ1328L2", "LK1085L2", "PCX_15_30_20", "PCV_15_30_20"}
+
+
+# --- picture --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("front", "LJ1477L1"),
+        ("back", "LJ1477L1"),
+        ("gap", 4.0),
+        ("sensor_dist", 35.0),
+        ("source_dist", 1800.0),
+        ("axis_off", 250.0),
+        ("led_spacing", 500.0),
+        ("focus", True),
+    ],
+)
+def test_every_control_changes_the_picture(name: str, value: Any) -> None:
+    explorer = Explorer(**SETTINGS)
+    control = getattr(explorer, name)
+    before, readout, start = explorer.picture.value, explorer.readout.value, control.value
+    control.value = value
+    assert explorer.picture.value != before
+    assert explorer.readout.value != readout
+    if name == "focus":  # switching it off leaves the sensor where it is
+        return
+    control.value = start
+    assert explorer.picture.value == before
+    assert explorer.readout.value == readout
+
+
+def test_the_picture_is_the_canvas(shared: Explorer) -> None:
+    shared.source_dist.value = 1730.0
+    picture = pixels(shared)
+    canvas = np.asarray(shared._drawing._canvas.buffer_rgba())
+    assert picture.dtype == np.uint8
+    assert picture.shape == (400, 960, 3)
+    assert_array_equal(picture, canvas[..., :3])
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 20
+
+
+@pytest.mark.parametrize(
+    "moves",
+    [
+        [("source_dist", 3000.0), ("axis_off", 900.0), ("led_spacing", 800.0)],
+        # far enough for the background to be drawn anew, once and twice
+        [("source_dist", 700.0), ("sensor_dist", 120.0), ("axis_off", 10.0)],
+        [("sensor_dist", 300.0), ("gap", 7.0), ("sensor_dist", 40.0)],
+        [("back", "LJ1144L1"), ("front", "LJ1144L1"), ("focus", True)],
+    ],
+)
+def test_a_moved_explorer_shows_what_a_new_one_does(moves: list[tuple[str, Any]]) -> None:
+    explorer = Explorer(**SETTINGS)
+    for name, value in moves:
+        getattr(explorer, name).value = value
+    settings = {name: getattr(explorer, name).value for name in SETTINGS}
+    if explorer.focus.value:
+        settings["sensor_dist"] = None
+    new = Explorer(**settings)
+    assert explorer._drawing._reach == new._drawing._reach  # the same part of the axis is shown
+    assert explorer.picture.value == new.picture.value
+    assert explorer.readout.value == new.readout.value
+
+
+def test_the_picture_shows_the_rays(shared: Explorer) -> None:
+    """What is drawn: rays that meet in the focus, the sensor, the field on the line of LEDs."""
+    shared.source_dist.value, shared.axis_off.value = 2000.0, 300.0
+    drawing, view = shared._drawing, shared.view()
+    focus = cast_rays(30, view.matrix, 2000, 300)
+    for ray in drawing._rays:
+        z, heights = (np.asarray(values, float) for values in ray.get_data())
+        slope = (heights[-1] - heights[-2]) / (z[-1] - z[-2])
+        height = heights[-2] + slope * (view.system.length + focus.focal_length - z[-2])
+        assert height == pytest.approx(focus.focal_offset, rel=1e-9)
+    assert_array_equal(drawing._line.get_xdata(), [view.system.length + view.sensor_dist] * 2)
+    assert_array_equal(drawing._line.get_ydata(), [-HALF, HALF])
+    edge = field_edge(view.matrix, 2000, HALF, view.sensor_dist)
+    corners = 1000 * drawing._field.get_xy()
+    assert corners[:3].tolist() == pytest.approx(
+        np.array([[300, 2000], [300 - edge, 0], [300 + edge, 0]])
+    )
+    assert drawing._tracked.get_y() * 1000 == pytest.approx(view.tracking_start)
+
+
+# --- the sensor in the focus ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("front", ["LJ1695L1", "LJ1567L1", "LJ1653L1"])
+@pytest.mark.parametrize("gap", [0.0, 8.0])
+def test_the_sensor_follows_the_focus(shared: Explorer, front: str, gap: float) -> None:
+    shared.front.value, shared.gap.value = front, gap
+    matrix = telecentric_pair(front, shared.back.value, gap).matrix("x")
+    focus = cast_rays(30, matrix, 5000, 0).focal_length
+    assert shared.focus.value
+    assert shared.sensor_dist.disabled
+    assert shared.sensor_dist.value == focus
+    assert shared.view().sensor_dist == focus
+
+
+def test_the_sensor_follows_the_longest_focus() -> None:
+    explorer = Explorer("LJ1516L1", "LJ1516L1", gap=10.0)
+    focus = cast_rays(30, explorer.view().matrix, 5000, 0).focal_length
+    assert explorer.view().sensor_dist == focus
+    assert explorer.sensor_dist.value == focus  # the slider is not at its end
+
+
+def test_the_sensor_can_be_let_go() -> None:
+    explorer = Explorer()
+    focus = explorer.sensor_dist.value
+    explorer.focus.value = False
+    assert not explorer.sensor_dist.disabled
+    assert explorer.sensor_dist.value == focus
+    explorer.back.value = "LJ1567L1"
+    assert explorer.sensor_dist.value == explorer.view().sensor_dist == focus  # stays
+    explorer.sensor_dist.value = 30.0
+    assert explorer.view().sensor_dist == 30.0
+    explorer.focus.value = True
+    assert explorer.sensor_dist.disabled
+    matrix = telecentric_pair("PCX_30_32_60", "LJ1567L1").matrix("x")
+    assert explorer.sensor_dist.value == cast_rays(30, matrix, 5000, 0).focal_length
+
+
+# --- errors ---------------------------------------------------------------------------------
+
+
+def test_an_error_is_raised_and_shown_and_goes_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    explorer = Explorer()
+    good = explorer.picture.value
+    assert explorer.error.value == ""
+
+    def fail(_view: object) -> bytes:
+        raise ZeroDivisionError("the <lens> is & broken")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(explorer._drawing, "png", fail)
+        for value in (3000.0, 3100.0):
+            with pytest.raises(ZeroDivisionError, match="is & broken"):
+                explorer.source_dist.value = value
+            shown = explorer.error.value
+            assert "ZeroDivisionError: the &lt;lens&gt; is &amp; broken" in shown
+            assert "Traceback" in shown
+            assert "<lens>" not in shown
+    assert explorer.picture.value == good  # the last one that could be drawn
+
+    explorer.source_dist.value = 3200.0
+    assert explorer.error.value == ""
+    assert explorer.picture.value == Explorer(source_dist=3200.0).picture.value
+
+
+def test_errors_of_the_studies_are_raised_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    explorer = Explorer()
+    with monkeypatch.context() as broken:
+        broken.setattr("raytransfer.explorer.tracking_start", lambda *_: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            explorer.gap.value = 1.0
+        assert "ZeroDivisionError" in explorer.error.value
+    explorer.gap.value = 2.0
+    assert explorer.error.value == ""
+
+
+@pytest.mark.parametrize(
+    ("name", "bad"),
+    [
+        ("gap", -1.0),
+        ("gap", 11.0),
+        ("sensor_dist", 0.0),
+        ("sensor_dist", 1000.0),
+        ("source_dist", 10_000.0),
+        ("source_dist", math.nan),
+        ("axis_off", 5000.0),
+        ("led_spacing", 1.0),
+    ],
+)
+def test_settings_beyond_the_sliders_are_refused(name: str, bad: float) -> None:
+    settings: Any = {name: bad}
+    with pytest.raises(ValueError, match=rf"= {bad:g} mm: the explorer goes from"):
+        Explorer(**settings)
+
+
+@pytest.mark.parametrize("name", ["front", "back"])
+@pytest.mark.parametrize("bad", ["LJ0000", "LJ1328L2"])
+def test_lenses_that_are_not_offered_are_refused(name: str, bad: str) -> None:
+    settings: Any = {name: bad}
+    with pytest.raises(ValueError, match=bad):
+        Explorer(**settings)
