@@ -290,7 +290,7 @@ def test_arguments_are_not_changed() -> None:
 # --- parallel rays --------------------------------------------------------------------------
 
 
-@settings(deadline=None, max_examples=300)
+@settings(deadline=None)
 @given(matrices(), offsets, st.integers(-1, 1))
 def test_a_source_in_the_front_focus_leaves_parallel(
     abcd: NDArray[np.float64], off: float, steps: int

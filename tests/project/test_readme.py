@@ -1,0 +1,41 @@
+"""The README says what is so: its examples run, its tables are the program's."""
+
+from __future__ import annotations
+
+import doctest
+import re
+from pathlib import Path
+
+from raytransfer.thesis import claims
+
+ROOT = Path(__file__).parents[2]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def test_examples_give_what_is_printed() -> None:
+    result = doctest.testfile(str(ROOT / "README.md"), module_relative=False)
+    assert result.attempted >= 10
+    assert result.failed == 0
+
+
+def test_table_of_claims_is_up_to_date() -> None:
+    for claim in claims():
+        assert "| " + " | ".join(claim.cells()[:5]) + " |" in README
+    quoted = [claim for claim in claims() if claim.quoted]
+    assert len(quoted) == 12
+    assert [claim.id for claim in quoted if not claim.agrees] == ["O7", "O9"]
+
+
+def test_links_and_commands_exist() -> None:
+    links = re.findall(r"\]\(([^)#]+)\)", README)
+    assert links
+    for link in links:
+        assert (ROOT / link).exists(), link
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    for target in set(re.findall(r"\bmake ([a-z]+)", README)):
+        assert re.search(rf"^{target}:", makefile, flags=re.MULTILINE), f"make {target}"
+
+
+def test_every_notebook_is_listed() -> None:
+    for path in (ROOT / "notebooks").glob("*.ipynb"):
+        assert f"(notebooks/{path.name})" in README
