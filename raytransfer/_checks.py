@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from numbers import Real
+from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -46,6 +46,15 @@ def not_negative(name: str, value: Any, hint: str = "") -> float:
     if result < 0:
         raise ValueError(f"{name} = {result:g}: allowed is >= 0{_because(hint)}")
     return result
+
+
+def whole(name: str, value: Any) -> int:
+    """Return the value as an integer, 1 or above, or refuse it."""
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise TypeError(f"{name} = {value!r}: a whole number is needed")
+    if not isinstance(value, Integral) or value < 1:
+        raise ValueError(f"{name} = {value}: allowed are whole numbers from 1 on")
+    return int(value)
 
 
 def refractive_index(name: str, value: Any) -> float:

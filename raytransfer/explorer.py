@@ -149,13 +149,22 @@ class Explorer(widgets.VBox):  # type: ignore[misc]
             for name, lens in {**THESIS_LENSES, **CATALOGUE}.items()
             if lens.radius > 0 and lens.height >= sensor.length
         ]
+        if not names:
+            raise ValueError(
+                f"no lens is as high as the {sensor.name} is long ({sensor.length:g} mm)"
+            )
+        for argument, name in (("front", front), ("back", back)):
+            if name not in names:
+                raise ValueError(f"{argument} = {name!r}: the explorer has {', '.join(names)}")
         self.front = widgets.Dropdown(options=names, value=front, description="front lens")
         self.back = widgets.Dropdown(options=names, value=back, description="back lens")
         self.gap = _slider("gap", "mm", gap, 0, 10, 0.1)
         self.focus = widgets.Checkbox(
             value=sensor_dist is None, description="sensor in the focus of 5 m", indent=False
         )
-        self.sensor_dist = _slider("sensor", "mm", sensor_dist or 26, 5, 520, 0.05)
+        self.sensor_dist = _slider(
+            "sensor", "mm", 26.0 if sensor_dist is None else sensor_dist, 5, 600, 0.05
+        )
         self.source_dist = _slider("source", "mm", source_dist, 200, _ROOM_DEPTH, 10)
         self.axis_off = _slider("offset", "mm", axis_off, -_ROOM_WIDTH, _ROOM_WIDTH, 10)
         self.led_spacing = _slider("LED spacing", "mm", led_spacing, 100, 2000, 10)
@@ -316,13 +325,16 @@ class Drawing:
         for artists in self.moving.values():
             for artist in artists:
                 artist.set_animated(True)
+        # lay out once, so that the axes stay where they are whatever is shown
+        self._canvas.draw()
+        self.figure.set_layout_engine("none")
         self._reach = 0.0
         self._background: Any = None
 
     def place(self, view: View) -> None:
         """Put all artists where the view has them."""
         system, source_dist, axis_off = view.system, view.source_dist, view.axis_off
-        self._fit(system.length + 1.3 * view.sensor_dist)
+        self._show_up_to(system.length + 1.3 * view.sensor_dist)
         for patch, placed in zip(self._lenses, system.layout(), strict=True):
             patch.set_xy(plots.outline(placed, "x", view.half_length))
         z, heights = plots.ray_paths(
@@ -358,11 +370,12 @@ class Drawing:
                 axes.draw_artist(artist)
         return _png(np.asarray(self._canvas.buffer_rgba())[..., :3])
 
-    def _fit(self, reach: float) -> None:
-        """Draw the background anew where the optics do not fit its axes, or use little of them."""
-        if self._background is None or not 0.6 * self._reach <= reach <= self._reach:
-            self._reach = 20 * math.ceil(1.2 * reach / 20)
-            self._optics.set_xlim(-_LEAD, self._reach)
+    def _show_up_to(self, z: float) -> None:
+        """Draw the background anew if its axis must reach further, or much less far."""
+        reach = 10 * 1.25 ** math.ceil(math.log(z / 10, 1.25))
+        if reach != self._reach:
+            self._reach = reach
+            self._optics.set_xlim(-_LEAD, reach)
             self._canvas.draw()
             self._background = self._canvas.copy_from_bbox(self.figure.bbox)
 

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 
+_BLOCK = 65536
+"""Rays multiplied at once. Above about 250,000 OpenBLAS packs and threads, at half the speed."""
+
+
 class RayMatrix:
     """A numeric 2 × 2 ray transfer matrix that knows the media on its two sides.
 
@@ -56,7 +60,8 @@ class RayMatrix:
         self.n1 = None if n1 is None else check.refractive_index("n1", n1)
         self.n2 = None if n2 is None else check.refractive_index("n2", n2)
         (a, b), (c, d) = values
-        if abs(a * d - b * c - self.determinant) > 1e-9 * (abs(a * d) + abs(b * c)):
+        size = abs(a * d) + abs(b * c)
+        if not abs(a * d - b * c - self.determinant) <= 1e-9 * size < math.inf:
             raise ValueError(
                 f"determinant {a * d - b * c:.9g}: a ray matrix from n1 = {self.n1} to "
                 f"n2 = {self.n2} has n1/n2 = {self.determinant:.9g}; was it scaled, or do the "
@@ -117,9 +122,17 @@ class RayMatrix:
                 f"{_shown(rays)} is neither a ray matrix nor rays of shape (2, ...); "
                 "a ray matrix times a number is not a ray matrix, and rays stand to its right"
             )
-        if array.ndim <= 2:
-            return np.matmul(self._abcd, array, out=out)
-        return np.matmul(self._abcd, array.reshape(2, -1), out=out).reshape(array.shape)
+        flat = array if array.ndim == 1 else array.reshape(2, -1)
+        if flat.ndim == 1 or flat.shape[1] <= _BLOCK:
+            result = np.matmul(self._abcd, flat, out=out)
+        else:
+            result = np.empty(flat.shape) if out is None else out
+            if np.may_share_memory(result, flat):
+                flat = flat.copy()
+            for start in range(0, flat.shape[1], _BLOCK):
+                columns = slice(start, start + _BLOCK)
+                np.matmul(self._abcd, flat[:, columns], out=result[:, columns])
+        return result if out is not None else result.reshape(array.shape)
 
     def __matmul__(self, other: Any) -> Any:
         """Return the product with a matrix the light met before, or with rays."""

@@ -177,6 +177,11 @@ def plot_focus(
     """
     matrix = system.matrix("x")
     focus, _ = cast_rays(lens_width, matrix, source_dist, 0.0)
+    if not 0 < focus < np.inf:
+        raise ValueError(
+            f"source_dist = {source_dist:g} mm: the source is within the front focal length "
+            "and has no focus behind the lenses"
+        )
     width = beam_width(lens_width, matrix, source_dist, sensor_dist)
     defocus = focus - sensor_dist
     shown = sensor_dist + magnify * defocus

@@ -44,11 +44,14 @@ class LineSensor:
     top_to_chip: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("pixels", "pitch", "pixel_height"):
+        check.whole(f"pixels of {self.name}", self.pixels)
+        for name in ("pitch", "pixel_height"):
             check.positive(f"{name} of {self.name}", getattr(self, name))
         if (self.window is None) != (self.top_to_chip is None):
             raise ValueError(f"{self.name}: give window and top_to_chip both, or neither")
-        if self.window and self.top_to_chip and self.top_to_chip < self.window.thickness:
+        if self.window is None or self.top_to_chip is None:
+            return
+        if check.number(f"top_to_chip of {self.name}", self.top_to_chip) < self.window.thickness:
             raise ValueError(
                 f"top_to_chip of {self.name} = {self.top_to_chip:g} mm: it includes the window, "
                 f"{self.window.thickness:g} mm; was only the air below it given?"

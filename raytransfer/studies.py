@@ -62,6 +62,7 @@ def image_position(
     """
     if sensor_dist is None:
         return cast_rays(1.0, lens_mat, source_dist, axis_off).focal_offset
+    check.number("sensor_dist", sensor_dist)
     top, bottom = cast_rays_to_focal_length(1.0, lens_mat, source_dist, axis_off, sensor_dist)
     return (top + bottom) / 2
 
@@ -81,6 +82,7 @@ def beam_width(
     lens_mat, source_dist, sensor_dist
         As for `image_position`. The offset of the source does not matter paraxially.
     """
+    check.number("sensor_dist", sensor_dist)
     top, bottom = cast_rays_to_focal_length(lens_width, lens_mat, source_dist, 0.0, sensor_dist)
     return np.abs(top - bottom)
 
@@ -128,6 +130,7 @@ def axial_resolution(
     if sensor_dist is None:
         slope = np.abs(c * det) / (c * dist + d) ** 2
     else:
+        check.number("sensor_dist", sensor_dist)
         slope = abs(b + sensor_dist * d) / dist**2
     return pitch / (base * slope)
 
@@ -179,15 +182,14 @@ def tracking_start(
         If the system forms no real image.
     """
     check.positive("half_length", half_length)
-    if leds < 1:
-        raise ValueError(f"leds = {leds}: at least one LED must be seen")
     _, b, c, d, det = elements(lens_mat)
     if c >= 0:
         raise ValueError(f"C = {c:g}: a system without positive power forms no real image")
-    edge = check.positive_array("led_spacing", led_spacing) * leds / 2
+    edge = check.positive_array("led_spacing", led_spacing) * check.whole("leds", leds) / 2
     if sensor_dist is None:
-        start = -(edge * det / half_length + d) / c
+        start = np.maximum(-(edge * det / half_length + d) / c, 0.0)
     else:
+        check.number("sensor_dist", sensor_dist)
         start = edge / half_length * abs(b + sensor_dist * d)
     return start if np.ndim(start) else float(start)
 
@@ -213,6 +215,7 @@ def untracked_margin(
     half = check.positive("lens_width", lens_width) / 2
     a, b, c, d, _ = elements(lens_mat)
     dist = check.positive_array("source_dist", source_dist)
+    check.number("sensor_dist", sensor_dist)
     # the ray through the edge that ends on the axis arrives with the angle −half·(a + s c)/(b + s d)
     slope = (a + sensor_dist * c) / (b + sensor_dist * d)
     margin = np.abs(half * (1 + dist * slope))
@@ -310,8 +313,7 @@ def lens_selection(
 
 def led_line(count: int, spacing: float) -> NDArray[Any]:
     """Room x of `count` LEDs, `spacing` mm apart, centred on 0."""
-    if count < 1:
-        raise ValueError(f"count = {count}: at least one LED is needed")
+    check.whole("count", count)
     check.positive("spacing", spacing)
     return (np.arange(count) - (count - 1) / 2) * spacing
 
@@ -345,6 +347,8 @@ def room_to_optical(
         Optical X and distance along the axis, mm; the distance is negative behind the tracker.
     """
     points = check.array("points", points)
+    if points.ndim != 2 or points.shape[1] != 2:
+        raise ValueError(f"points has shape (N, 2), not {points.shape}")
     x, y = np.broadcast_arrays(check.array("x", x), check.array("y", y))
     shape = (-1,) + (1,) * x.ndim
     dx = points[:, 0].reshape(shape) - x
@@ -410,7 +414,8 @@ class ResolutionMap(AreaMap):
     lateral : ndarray, shape (H, W)
         Sideways move per pixel, mm, for the middle of the LEDs that are seen.
     axial : ndarray, shape (H, W)
-        Move along the axis per pixel of separation of the outermost LEDs that are seen, mm.
+        Move along the axis per pixel of separation of the outermost LEDs that are seen, mm;
+        infinite where these are in one direction.
     """
 
     lateral: NDArray[np.float64]
@@ -456,12 +461,16 @@ def _map(
     check.positive("half_length", half_length)
     points = _positions_of(leds)
     x, y = np.atleast_1d(check.array("x", x)), np.atleast_1d(check.array("y", y))
+    for name, grid in (("x", x), ("y", y)):
+        if grid.ndim != 1:
+            raise ValueError(f"{name} has shape (N,), not {grid.shape}; the grid is made from both")
     axis_off, source_dist = room_to_optical(points, x[None, :], y[:, None], heading)
     ahead = source_dist > 0
     dist = np.where(ahead, source_dist, 1.0)
     position = image_position(lens_mat, dist, axis_off, sensor_dist)
     if sensor_dist is None:  # a source within the front focal length has no real image
-        ahead &= cast_rays(1.0, lens_mat, dist, 0.0).focal_length > 0
+        focus = cast_rays(1.0, lens_mat, dist, 0.0).focal_length
+        ahead &= (focus > 0) & np.isfinite(focus)
     area = AreaMap(x, y, points, np.where(ahead, position, np.inf), half_length)
     return area, axis_off, source_dist
 
@@ -491,11 +500,13 @@ def resolution_map(
     enough = count >= 2
     low = np.where(visible, axis_off, np.inf).min(axis=0)
     high = np.where(visible, axis_off, -np.inf).max(axis=0)
-    baseline = np.where(enough, high - low, 1.0)
+    baseline = np.where(enough, high, 1.0) - np.where(enough, low, 0.0)
     total = np.where(visible, source_dist, 0.0).sum(axis=0)
     middle = np.where(enough, total / np.maximum(count, 1), 1.0)
     lateral = lateral_resolution(lens_mat, middle, sensor.pitch, sensor_dist)
-    axial = axial_resolution(lens_mat, middle, baseline, sensor.pitch, sensor_dist)
+    apart = baseline > 0  # images that coincide say nothing about the distance
+    safe = np.where(apart, baseline, 1.0)
+    axial = axial_resolution(lens_mat, middle, safe, sensor.pitch, sensor_dist)
     return ResolutionMap(
         area.x,
         area.y,
@@ -503,7 +514,7 @@ def resolution_map(
         area.position,
         half_length,
         lateral=np.where(enough, lateral, np.nan),
-        axial=np.where(enough, axial, np.nan),
+        axial=np.where(enough, np.where(apart, axial, np.inf), np.nan),
     )
 
 

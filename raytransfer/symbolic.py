@@ -27,9 +27,12 @@ if TYPE_CHECKING:
 
 def checked(rule: Callable[[str, Any], float], name: str, value: Any) -> Any:
     """Sympify the value; one that is a number must also pass the rule."""
-    expression = sympy.sympify(value)
+    expression = None if isinstance(value, str) else sympy.sympify(value)
     if not isinstance(expression, sympy.Expr):
-        raise TypeError(f"{name} = {value!r}: arrays and symbols do not mix; lambdify the result")
+        raise TypeError(
+            f"{name} = {value!r}: a number or an expression is needed; arrays and symbols do not "
+            "mix: lambdify the result"
+        )
     if expression.is_number:
         if not expression.is_extended_real:
             raise ValueError(f"{name} = {expression}: a real number is needed")
@@ -77,5 +80,8 @@ def elements(lens_mat: Any) -> tuple[Any, ...]:
     """Return A, B, C, D and the determinant as sympy expressions."""
     if isinstance(lens_mat, RayMatrix):
         return tuple(sympy.sympify(value) for value in matrices.elements(lens_mat))
-    a, b, c, d = sympy.Matrix(lens_mat)
+    array = sympy.Matrix(lens_mat)
+    if array.shape != (2, 2):
+        raise ValueError(f"lens_mat has shape (2, 2), not {array.shape}")
+    a, b, c, d = (checked(check.number, "lens_mat", element) for element in array)
     return a, b, c, d, sympy.cancel(a * d - b * c)
