@@ -21,8 +21,9 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 
-_BLOCK = 65536
-"""Rays multiplied at once. Above about 250,000 OpenBLAS packs and threads, at half the speed."""
+_BLOCK = 16384
+"""Rays multiplied at once: few enough to stay in the cache, where the product costs nothing beside
+the memory traffic. At some 250,000 OpenBLAS begins to pack and thread, at half the speed."""
 
 
 class RayMatrix:
@@ -105,7 +106,8 @@ class RayMatrix:
         rays : array_like, shape (2, ...)
             Heights (mm) and angles (rad).
         out : ndarray, shape (2, N), optional
-            Where to put the result; saves the time for new memory.
+            Where to put the result; saves the time for new memory. With ``out=rays`` the result
+            replaces the rays, which is fastest.
 
         Returns
         -------
@@ -122,13 +124,15 @@ class RayMatrix:
                 f"{_shown(rays)} is neither a ray matrix nor rays of shape (2, ...); "
                 "a ray matrix times a number is not a ray matrix, and rays stand to its right"
             )
-        flat = array if array.ndim == 1 else array.reshape(2, -1)
-        if flat.ndim == 1 or flat.shape[1] <= _BLOCK:
+        flat = array if array.ndim <= 2 else array.reshape(2, -1)
+        if out is not None and out.shape != flat.shape:
+            raise ValueError(f"out has shape {flat.shape}, not {out.shape}")
+        if flat.size <= 2 * _BLOCK:
             result = np.matmul(self._abcd, flat, out=out)
         else:
             result = np.empty(flat.shape) if out is None else out
-            if np.may_share_memory(result, flat):
-                flat = flat.copy()
+            if result is not array and np.may_share_memory(result, flat):
+                flat = flat.copy()  # else a block could overwrite the next one's rays
             for start in range(0, flat.shape[1], _BLOCK):
                 columns = slice(start, start + _BLOCK)
                 np.matmul(self._abcd, flat[:, columns], out=result[:, columns])

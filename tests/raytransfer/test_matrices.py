@@ -185,8 +185,8 @@ def test_star_and_at_are_the_same(
     ray = input_vec(height, angle)
     assert_array_equal(by_star * ray, by_at @ ray)
     one_by_one = reduce(lambda at, part: part @ at, parts, ray)
-    scale = np.abs(np.asarray(by_at)).max() * max(abs(height), abs(angle))
-    assert_allclose(by_at @ ray, one_by_one, rtol=0, atol=1e-9 * scale)
+    size = reduce(lambda at, part: np.abs(np.asarray(part)) @ at, parts, np.abs(ray))
+    assert_allclose(by_at @ ray, one_by_one, rtol=0, atol=TIGHT * size.max())
 
 
 def test_order_is_right_to_left() -> None:
@@ -374,11 +374,41 @@ def test_rays_of_any_shape_go_through(shape: tuple[int, ...]) -> None:
     assert_array_equal(PCX.propagate(rays), result)
 
 
-def test_propagate_writes_into_out() -> None:
-    rays = np.arange(6.0).reshape(2, 3)
-    out = np.empty_like(rays)
+MANY = [1, 3, 65_536, 131_072, 200_001]  # the last three are sent through in blocks
+
+
+@pytest.mark.parametrize("count", MANY)
+def test_however_many_rays_each_goes_its_way(count: int) -> None:
+    height, angle = rays = np.random.default_rng(5).normal(size=(2, count))
+    expected = [PCX.A * height + PCX.B * angle, PCX.C * height + PCX.D * angle]
+    assert_allclose(PCX @ rays, expected, rtol=TIGHT, atol=1e-14)
+    assert_array_equal(PCX @ rays.reshape(2, count, 1), (PCX @ rays).reshape(2, count, 1))
+    assert_array_equal(PCX @ rays[:, ::-1], (PCX @ rays)[:, ::-1])
+
+
+@pytest.mark.parametrize("count", MANY)
+def test_propagate_writes_into_out(count: int) -> None:
+    rays = np.random.default_rng(5).normal(size=(2, count))
+    expected, out = PCX @ rays, np.empty_like(rays)
     assert PCX.propagate(rays, out=out) is out
-    assert_array_equal(out, PCX @ rays)
+    assert_array_equal(out, expected)
+    assert PCX.propagate(rays, out=rays) is rays  # in place
+    assert_array_equal(rays, expected)
+
+
+@pytest.mark.parametrize("count", MANY)
+def test_out_may_overlap_the_rays(count: int) -> None:
+    memory = np.random.default_rng(5).normal(size=(2, count + 1))
+    expected = PCX @ memory[:, :-1].copy()
+    PCX.propagate(memory[:, :-1], out=memory[:, 1:])
+    assert_array_equal(memory[:, 1:], expected)
+
+
+@pytest.mark.parametrize("count", MANY)
+@pytest.mark.parametrize(("rows", "more"), [(2, 1), (2, -1), (3, 0), (1, 0)])
+def test_an_out_of_another_shape_is_refused(count: int, rows: int, more: int) -> None:
+    with pytest.raises(ValueError, match=r"(?i)\bout"):
+        PCX.propagate(np.ones((2, count)), out=np.empty((rows, count + more)))
 
 
 @pytest.mark.parametrize(
@@ -513,4 +543,25 @@ def test_latex() -> None:
     )
     assert RayMatrix([[1.0, 2.5e-7], [0.0, 1.0]])._repr_latex_() == (
         r"$\displaystyle \begin{bmatrix}1 & 2.5 \cdot 10^{-7} \\ 0 & 1\end{bmatrix}$"
+    )
+
+
+@pytest.mark.parametrize("count", [1, 5, 16384, 16385, 40_000])
+def test_many_rays_are_the_same_as_few(count: int) -> None:
+    """However propagate divides them: into new memory, into `out`, in place, or overlapping."""
+    matrix = RayMatrix([[0.87, 7.26], [(0.87 * 0.87 - 1) / 7.26, 0.87]])
+    rays = np.random.default_rng(count).normal(size=(2, count))
+    expected = np.asarray(matrix) @ rays
+    assert_allclose(matrix @ rays, expected, rtol=1e-12, atol=1e-15)
+    out = np.empty_like(rays)
+    assert matrix.propagate(rays, out=out) is out
+    assert_allclose(out, expected, rtol=1e-12, atol=1e-15)
+    in_place = rays.copy()
+    assert matrix.propagate(in_place, out=in_place) is in_place
+    assert_allclose(in_place, expected, rtol=1e-12, atol=1e-15)
+    shifted = np.concatenate([rays, np.zeros((2, 7))], axis=1)
+    matrix.propagate(shifted[:, :count], out=shifted[:, 7:])
+    assert_allclose(shifted[:, 7:], expected, rtol=1e-12, atol=1e-15)
+    assert_allclose(
+        matrix @ rays.reshape(2, 1, count), expected[:, None, :], rtol=1e-12, atol=1e-15
     )
