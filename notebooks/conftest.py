@@ -2,13 +2,14 @@
 
 Every cell's text, LaTeX, tables and streams are compared by nbval. On top of that
 
-* figures are compared by the RMS of their grey levels;
+* figures are compared by the RMS of their grey levels, and of their colours within small squares;
 * what an `Output` widget captured belongs to that widget, not to the cell, and an error that it
   captured fails the cell;
 * a closing semicolon silences a cell, as it does in a notebook;
 * a cell that was never run has nothing to compare with, and fails;
 * after the last cell the widgets themselves are compared with those saved in the notebook, and
-  every control is moved once: a callback that raises fails, wherever its traceback went.
+  every control is moved: a callback that raises fails, wherever its traceback went;
+* nbval's tags and comments that leave a cell unchecked are refused.
 
 `pytest notebooks/x.ipynb` is all it takes; nbval's own options are not needed.
 """
@@ -18,6 +19,7 @@ from __future__ import annotations
 import base64
 import io
 import json
+import re
 import shutil
 import tempfile
 from functools import partial
@@ -36,37 +38,73 @@ if TYPE_CHECKING:
 GREY_RMS = 2.0
 """Figures that differ by more than this many of 255 grey levels (root mean square) are different."""
 
+TILE = 32
+TILE_RMS = 5.0
+"""The same for colours within any square of so many pixels."""
+
+GREY = np.array([0.299, 0.587, 0.114])
+
 WIDGET_STATE = "application/vnd.jupyter.widget-state+json"
 
 NOT_COMPARED = ("children", "layout", "msg_id", "style")
 """What a widget's state holds of random ids."""
 
+NOT_ALLOWED = ("nbval-skip", "nbval-ignore-output", "nbval-raises-exception", "raises-exception")
+"""Tags, also as comments, that would leave a cell unchecked."""
+
 MOVE_EVERY_CONTROL = """
-import sys as _sys
 def _move_every_control():
-    if "ipywidgets" not in _sys.modules:
+    import sys
+    if "ipywidgets" not in sys.modules:
         return
     from ipywidgets import widgets as w
-    instances = list(w.widget._instances.values())
-    for control in instances:
-        if getattr(control, "disabled", False) or not hasattr(control, "value"):
-            continue
-        before = control.value
-        if isinstance(control, (w.FloatSlider, w.IntSlider)):
-            step = control.step if before + control.step <= control.max else -control.step
-            after = before + step
-        elif isinstance(control, (w.Checkbox, w.ToggleButton)):
-            after = not before
-        elif isinstance(control, (w.Dropdown, w.RadioButtons, w.Select, w.ToggleButtons)):
-            values = [option[1] for option in control._options_full]
-            after = values[(values.index(before) + 1) % len(values)]
-        elif isinstance(control, (w.FloatText, w.IntText)):
-            after = before + 1
-        else:
-            continue
-        control.value = after
-        control.value = before
-    for control in instances:
+    from ipywidgets.widgets import widget_float as f, widget_int as i, widget_selection as s
+    shows_only = (w.HTML, w.HTMLMath, w.Label, w.Image, w.Audio, w.Video, w.Valid,
+                  w.FloatProgress, w.IntProgress)
+
+    def elsewhere(control):
+        value = control.value
+        if isinstance(control, (w.Checkbox, w.ToggleButton)):
+            return [not value]
+        if isinstance(control, w.FloatLogSlider):
+            return [control.base ** control.min, control.base ** control.max]
+        if isinstance(control, (f._BoundedFloatRange, i._BoundedIntRange)):
+            return [(control.min, control.max), (control.min, control.min)]
+        if isinstance(control, (f._BoundedFloat, i._BoundedInt)):
+            step = control.step or (control.max - control.min) / 10
+            near = [v for v in (value - step, value + step) if control.min <= v <= control.max]
+            return [*near, control.min, control.max]
+        if isinstance(control, s._MultipleSelection):
+            return [(), control._options_values]
+        if isinstance(control, s.SelectionRangeSlider):
+            return [(control._options_values[0], control._options_values[-1])]
+        if isinstance(control, s._Selection):
+            return list(control._options_values)
+        if isinstance(control, (w.FloatText, w.IntText)):
+            return [value + 1]
+        if isinstance(control, (w.Text, w.Textarea, w.Combobox)):
+            return [value + "x"]
+        raise TypeError(f"the notebooks' guard does not know how to move a {type(control).__name__}")
+
+    def move(controls):
+        for control in controls:
+            before = control.value
+            for value in elsewhere(control):
+                control.value = value
+            control.value = before
+
+    controls = [control for control in w.widget._instances.values()
+                if hasattr(control, "value") and not isinstance(control, shows_only)]
+    enabled = [control for control in controls if not getattr(control, "disabled", False)]
+    move(enabled)
+    # what a switch enables is moved while it is the other way
+    for switch in enabled:
+        if isinstance(switch, (w.Checkbox, w.ToggleButton)):
+            switch.value = not switch.value
+            move([control for control in controls if control not in enabled
+                  and not control.disabled])
+            switch.value = not switch.value
+    for control in list(w.widget._instances.values()):
         if isinstance(control, w.Button):
             control.click()
 _move_every_control()
@@ -82,12 +120,22 @@ def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> StrictNote
     return notebook
 
 
-def grey_rms(one: bytes, other: bytes) -> float:
-    """Root mean square difference in grey levels; infinite for pictures of different size."""
-    a, b = (
-        np.asarray(Image.open(io.BytesIO(png)).convert("L"), dtype=float) for png in (one, other)
-    )
-    return float(np.sqrt(np.mean((a - b) ** 2))) if a.shape == b.shape else np.inf
+def picture_difference(one: bytes, other: bytes) -> str:
+    """Say how two pictures differ; empty if they do not."""
+    new, saved = (np.asarray(Image.open(io.BytesIO(p)).convert("RGB"), float) for p in (one, other))
+    if new.shape != saved.shape:
+        return f"size {new.shape[:2]} instead of {saved.shape[:2]}"
+    grey = np.sqrt(np.mean(((new - saved) @ GREY) ** 2))
+    if grey > GREY_RMS:
+        return f"RMS of grey levels {grey:.2f} > {GREY_RMS}"
+    # a line of another colour, a marker elsewhere: little in the whole, much where it is
+    square = np.mean((new - saved) ** 2, axis=2)
+    height, width = (size // TILE * TILE for size in square.shape)
+    tiles = square[:height, :width].reshape(height // TILE, TILE, width // TILE, TILE)
+    worst = np.sqrt(tiles.mean(axis=(1, 3)).max())
+    if worst > TILE_RMS:
+        return f"RMS of colour levels {worst:.2f} > {TILE_RMS} within {TILE} pixels"
+    return ""
 
 
 class StrictNotebook(IPyNbFile):  # type: ignore[misc]
@@ -172,6 +220,11 @@ class StrictCell(IPyNbCell):  # type: ignore[misc]
 
     def runtest(self) -> None:
         """Refuse a cell that was saved without having run; nbval would pass it unchecked."""
+        tags = [tag.lower().replace("_", "-") for tag in self.cell.metadata.get("tags", ())]
+        comments = self.cell.source.lower().replace("_", "-")
+        for tag in NOT_ALLOWED:
+            if tag in tags or re.search(rf"^\s*#\s*{tag}\s*$", comments, flags=re.MULTILINE):
+                self.raise_cell_error(f"{tag} would leave this cell unchecked")
         if self.cell.execution_count is None and self.cell.source.strip():
             self.raise_cell_error("This cell was saved without having run")
         super().runtest()
@@ -185,10 +238,8 @@ class StrictCell(IPyNbCell):  # type: ignore[misc]
             self.comparison_traceback.append(f"{len(saved)} figures saved, {len(new)} drawn")
             return False
         for number, (one, other) in enumerate(zip(new, saved, strict=True), start=1):
-            if (rms := grey_rms(one, other)) > GREY_RMS:
-                self.comparison_traceback.append(
-                    f"figure {number} differs: RMS of grey levels {rms:.2f} > {GREY_RMS}"
-                )
+            if difference := picture_difference(one, other):
+                self.comparison_traceback.append(f"figure {number} differs: {difference}")
                 return False
         return True
 
@@ -200,23 +251,26 @@ class Widgets(pytest.Item):
 
     def runtest(self) -> None:
         """Compare states as text, pictures by their grey levels."""
+        models = list(self.parent.models.values())
         widgets = self.parent.nb.metadata.get("widgets")
-        if not widgets:
-            return  # saved without widget state, as JupyterLab does unless told otherwise
-        saved = [_saved_state(entry) for entry in widgets[WIDGET_STATE]["state"].values()]
-        saved_texts, saved_pictures = _split(saved)
-        new_texts, new_pictures = _split(list(self.parent.models.values()))
+        if models and not widgets:
+            raise NbCellError(0, "Widgets were not saved", "run: python notebooks/execute.py")
+        states = widgets[WIDGET_STATE]["state"].values() if widgets else ()
+        saved_texts, saved_pictures = _split([_saved_state(entry) for entry in states])
+        new_texts, new_pictures = _split(models)
         if saved_texts != new_texts:
             gone = [text for text in saved_texts if text not in new_texts]
             come = [text for text in new_texts if text not in saved_texts]
             message = ["saved, but not so now:", *gone, "now, but not saved:", *come]
             raise NbCellError(0, "Widgets differ", "\n".join(message))
         for picture in saved_pictures:
-            best = min((grey_rms(picture, other) for other in new_pictures), default=np.inf)
-            if best > GREY_RMS:
-                raise NbCellError(
-                    0, "A widget's picture differs", f"RMS of grey levels {best:.2f} > {GREY_RMS}"
-                )
+            same = [new for new in new_pictures if not picture_difference(new, picture)]
+            if not same:
+                reasons = (picture_difference(new, picture) for new in new_pictures)
+                raise NbCellError(0, "A widget's picture differs", "; ".join(reasons))
+            new_pictures.remove(same[0])
+        if new_pictures:
+            raise NbCellError(0, f"{len(new_pictures)} more pictures in widgets than saved", "")
 
     def repr_failure(self, excinfo: Any, style: Any = None) -> Any:
         """Show what differs, without a traceback of this file."""

@@ -59,7 +59,7 @@ def whole(name: str, value: Any) -> int:
 
 def refractive_index(name: str, value: Any) -> float:
     """Return the value as a refractive index, or refuse it."""
-    result = number(name, value)
+    result = number(name, value, "a refractive index is 1 or more")
     if result < 1:
         raise ValueError(
             f"{name} = {result:g}: a refractive index is 1 or more; "

@@ -22,6 +22,9 @@ _VIRTUAL = (
 )
 
 
+_WIDTH = "the full aperture of the lens in mm"
+
+
 class Focus(NamedTuple):
     """Where the rays of a source meet: behind the system and off the axis, both in mm."""
 
@@ -75,10 +78,11 @@ def cast_rays(lens_width: Any, lens_mat: Any, source_dist: Any, axis_off: Any) -
     """
     if check.is_symbolic(lens_width, lens_mat, source_dist, axis_off):
         return _cast_rays_symbolic(lens_width, lens_mat, source_dist, axis_off)
-    check.positive("lens_width", lens_width)
+    check.positive("lens_width", lens_width, _WIDTH)
     a, b, c, d, det = elements(lens_mat)
     dist = check.positive_array("source_dist", source_dist, _VIRTUAL)
     off = check.array("axis_off", axis_off)
+    _require_broadcast(source_dist=dist, axis_off=off)
     vergence = c * dist + d
     # c·dist and d cancel: what is left below a few rounding errors is nothing
     parallel = np.abs(vergence) <= 4 * np.finfo(float).eps * abs(d)
@@ -94,6 +98,17 @@ def cast_rays(lens_width: Any, lens_mat: Any, source_dist: Any, axis_off: Any) -
     if focal_length.shape != focal_offset.shape:
         focal_length = np.broadcast_to(focal_length, focal_offset.shape).copy()
     return Focus(focal_length, focal_offset)
+
+
+def _require_broadcast(**arrays: Any) -> None:
+    try:
+        np.broadcast_shapes(*(array.shape for array in arrays.values()))
+    except ValueError:
+        shapes = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
+        raise ValueError(
+            f"shapes do not broadcast: {shapes}; for a grid give one of them a further axis, "
+            "as in source_dist[:, None]"
+        ) from None
 
 
 def _cast_rays_symbolic(lens_width: Any, lens_mat: Any, source_dist: Any, axis_off: Any) -> Focus:
@@ -146,11 +161,12 @@ def cast_rays_to_focal_length(
         off = symbolic.checked(check.number, "axis_off", axis_off)
         length = symbolic.checked(check.number, "focal_length", focal_length)
     else:
-        half = check.positive("lens_width", lens_width) / 2
+        half = check.positive("lens_width", lens_width, _WIDTH) / 2
         abcd = elements(lens_mat)[:4]
         dist = check.positive_array("source_dist", source_dist, _VIRTUAL)
         off = check.array("axis_off", axis_off)
         length = check.array("focal_length", focal_length)
+        _require_broadcast(source_dist=dist, axis_off=off, focal_length=length)
     heights = [_height(abcd, y, (y - off) / dist, length) for y in (half, -half)]
     if np.ndim(heights[0]) == 0 and not check.is_symbolic(*heights):
         heights = [float(height) for height in heights]

@@ -30,6 +30,7 @@ from raytransfer.sensors import TCD1304, LineSensor
 from raytransfer.studies import (
     FAR,
     beam_width,
+    covers,
     field_edge,
     image_position,
     lateral_resolution,
@@ -80,7 +81,8 @@ class View:
     @property
     def leds(self) -> NDArray[np.float64]:
         """Room x of the LEDs of a long line, one of them, the source, at 0."""
-        reach = math.floor(_ROOM_WIDTH / self.led_spacing)
+        farthest = max(abs(self.axis_off) + self.field_edge, _ROOM_WIDTH)
+        reach = math.ceil(farthest / self.led_spacing)
         return np.arange(-reach, reach + 1) * np.float64(self.led_spacing)
 
     @property
@@ -99,7 +101,11 @@ class View:
         if abs(position) > self.half_length:
             where = "off the sensor"
         return {
-            "focus of this source": f"{focus:.3f} mm behind the lenses",
+            "focus of this source": (
+                f"{focus:.3f} mm behind the lenses"
+                if focus > 0
+                else f"virtual, {-focus:.3f} mm before the last surface"
+            ),
             "sensor": f"{self.sensor_dist:.3f} mm behind the lenses",
             "image": f"{position:.3f} mm, {where}",
             "beam width": f"{width:.3f} mm, {width / self.sensor.pitch:.0f} px",
@@ -145,9 +151,7 @@ class Explorer(widgets.VBox):  # type: ignore[misc]
     ) -> None:
         self._sensor = sensor
         names = [
-            name
-            for name, lens in {**THESIS_LENSES, **CATALOGUE}.items()
-            if lens.radius > 0 and lens.height >= sensor.length
+            name for name, lens in {**THESIS_LENSES, **CATALOGUE}.items() if covers(lens, sensor)
         ]
         if not names:
             raise ValueError(
@@ -286,7 +290,7 @@ class Drawing:
                 ylim=(-22, 22),
             )
             room.set(
-                title="room from above; shaded: no gaps",
+                title="room from above; shaded: two LEDs seen",
                 xlabel="x (m)",
                 ylabel="y from the LEDs (m)",
                 aspect="equal",

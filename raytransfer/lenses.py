@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 from raytransfer import _checks as check
 from raytransfer._data import FOLDER, read
@@ -25,6 +25,14 @@ def check_meridian(name: str, value: str) -> None:
     if value not in ("x", "y"):
         raise ValueError(
             f"{name} = {value!r}: allowed are 'x' (along the pixel line) and 'y' (across it)"
+        )
+
+
+def check_material(part: str, material: Material) -> None:
+    """Refuse anything but a material."""
+    if not isinstance(material, Material):
+        raise TypeError(
+            f"material of {part} = {material!r}: take one of MATERIALS, or ConstantIndex(name, n)"
         )
 
 
@@ -46,7 +54,8 @@ class Plate:
     material: Material
 
     def __post_init__(self) -> None:
-        check.positive(f"thickness of {self.part}", self.thickness)
+        check.positive(f"thickness of {self.part}", self.thickness, "a size in mm")
+        check_material(self.part, self.material)
 
     def matrix(
         self, meridian: Meridian, *, plates: bool = True, wavelength: float = D_LINE
@@ -93,8 +102,14 @@ class Lens:
     reversed: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("height", "length", "centre_thickness"):
-            check.positive(f"{name} of {self.part}", getattr(self, name))
+        for name in ("height", "length"):
+            check.positive(f"{name} of {self.part}", getattr(self, name), "a size in mm")
+        check.positive(
+            f"centre_thickness of {self.part}",
+            self.centre_thickness,
+            "the sign of a concave lens belongs to its radius",
+        )
+        check_material(self.part, self.material)
         check.radius(f"radius of {self.part}", self.radius)
         check_meridian("bends", self.bends)
         if abs(self.radius) < self.height / 2:
@@ -166,20 +181,22 @@ def _plate(thickness: float, n: float | None) -> RayMatrix:
     return matrix
 
 
+def _lens(part: str, entry: dict[str, Any]) -> Lens:
+    sizes = ("height", "length", "radius", "centre_thickness")
+    known = {*sizes, "material", "focal_length", "edge_thickness"}
+    if wrong := known ^ set(entry):
+        raise ValueError(f"lenses.toml, {part}: missing or unknown: {', '.join(sorted(wrong))}")
+    if entry["material"] not in MATERIALS:
+        raise ValueError(
+            f"lenses.toml, {part}: material {entry['material']!r}; known are {', '.join(MATERIALS)}"
+        )
+    material = MATERIALS[entry["material"]]
+    return Lens(part, material=material, **{size: entry[size] for size in sizes})
+
+
 def _lenses(table: str) -> MappingProxyType[str, Lens]:
-    return MappingProxyType(
-        {
-            part: Lens(
-                part,
-                entry["height"],
-                entry["length"],
-                entry["radius"],
-                entry["centre_thickness"],
-                MATERIALS[entry["material"]],
-            )
-            for part, entry in read(FOLDER / "lenses.toml")[table].items()
-        }
-    )
+    entries = read(FOLDER / "lenses.toml")[table]
+    return MappingProxyType({part: _lens(part, entry) for part, entry in entries.items()})
 
 
 CATALOGUE = _lenses("catalogue")

@@ -26,6 +26,12 @@ _BLOCK = 16384
 the memory traffic. At some 250,000 OpenBLAS begins to pack and thread, at half the speed."""
 
 
+_PLAIN = (
+    "a ray matrix * a plain 2 × 2 array: wrap the array in RayMatrix(...) if it is a matrix; "
+    "if it holds two rays, use @ or propagate"
+)
+
+
 class RayMatrix:
     """A numeric 2 × 2 ray transfer matrix that knows the media on its two sides.
 
@@ -170,8 +176,20 @@ class RayMatrix:
             )
         return array @ self._abcd
 
-    __mul__ = __matmul__
-    __rmul__ = __rmatmul__
+    def __mul__(self, other: Any) -> Any:
+        """Return the matrix product; a plain 2 × 2 array is refused.
+
+        Its product would be a plain array, and a further ``*`` would multiply element by element.
+        """
+        if isinstance(other, np.ndarray) and other.shape == (2, 2):
+            raise TypeError(_PLAIN)
+        return self @ other
+
+    def __rmul__(self, other: Any) -> Any:
+        """Return the matrix product; a plain 2 × 2 array is refused."""
+        if isinstance(other, np.ndarray) and other.shape == (2, 2):
+            raise TypeError(_PLAIN)
+        return self.__rmatmul__(other)
 
     def __array__(
         self,
@@ -235,7 +253,12 @@ def trans_mat(d: Any) -> Any:
         from raytransfer import symbolic
 
         return symbolic.trans_mat(d)
-    return RayMatrix([[1.0, check.number("d", d)], [0.0, 1.0]])
+    return RayMatrix(
+        [
+            [1.0, check.number("d", d, "a distance in mm, negative toward a virtual focus")],
+            [0.0, 1.0],
+        ]
+    )
 
 
 def refract_mat(n1: Any, n2: Any, R: Any) -> Any:
@@ -315,13 +338,21 @@ def input_vec(offset: Any, angle: Any) -> Any:
         from raytransfer import symbolic
 
         return symbolic.input_vec(offset, angle)
-    pair = np.broadcast_arrays(check.array("offset", offset), check.array("angle", angle))
+    pair = np.broadcast_arrays(
+        check.array("offset", offset, "a height in mm"),
+        check.array("angle", angle, "an angle in rad, not in degrees"),
+    )
     return np.stack(pair)
 
 
 def elements(lens_mat: Any) -> tuple[float, float, float, float, float]:
     """Return A, B, C, D and the determinant of a RayMatrix or a plain 2 × 2 array."""
     if not isinstance(lens_mat, RayMatrix):
+        if hasattr(lens_mat, "matrix"):
+            raise TypeError(
+                "lens_mat: a ray matrix is needed; a lens or system has one in each meridian, "
+                "so pass its .matrix('x') or .matrix('y')"
+            )
         values = check.array("lens_mat", lens_mat)
         if values.shape != (2, 2):
             raise ValueError(f"lens_mat has shape (2, 2), not {values.shape}")

@@ -105,7 +105,9 @@ def plot_ray_cast(
     ValueError
         If a number is not finite, or a width, length or distance is not positive.
     """
-    check.positive("lens_length", lens_length)
+    check.positive("lens_length", lens_length, "the length of the box in mm")
+    source_dist = check.positive("source_dist", source_dist, "one source is drawn")
+    axis_off = check.number("axis_off", axis_off, "one source is drawn")
     focal_length, focal_offset = cast_rays(lens_width, lens_mat, source_dist, axis_off)
     ax = ax if ax is not None else plt.subplots()[1]
     real = np.isfinite(focal_length) and focal_length > 0
@@ -210,6 +212,8 @@ def plot_focus(
         f"source at {source_dist / 1000:g} m{drawn}\nfocus {where}\nbeam {width:.3f} mm wide"
     )
     _axis(ax)
+    if magnify != 1:
+        ax.set_xlabel("along the axis (mm; not to scale behind the lenses)")
     return ax
 
 
@@ -394,6 +398,9 @@ def plot_tracking_area(area: AreaMap, ax: Axes, *, leds: int = 2) -> Axes:
     return ax
 
 
+LABELS = {"lateral": "sideways", "axial": "toward the LEDs"}
+
+
 def plot_resolution(
     resolution: ResolutionMap, ax: Axes, *, quantity: str = "lateral", levels: int = 9
 ) -> Axes:
@@ -407,7 +414,7 @@ def plot_resolution(
     levels : int
         About how many steps of colour.
     """
-    if quantity not in ("lateral", "axial"):
+    if quantity not in LABELS:
         raise ValueError(f"quantity = {quantity!r}: allowed are 'lateral' and 'axial'")
     values = np.ma.masked_invalid(getattr(resolution, quantity))
     if values.mask.all():
@@ -421,7 +428,7 @@ def plot_resolution(
         cmap="viridis_r",
         norm=BoundaryNorm(steps, 256),
     )
-    ax.figure.colorbar(mesh, ax=ax, label=f"{quantity} resolution (mm per pixel)")
+    ax.figure.colorbar(mesh, ax=ax, label=f"{LABELS[quantity]} (mm per pixel)")
     _draw_leds(ax, resolution)
     return ax
 
@@ -485,6 +492,15 @@ def plot_lens_comparison(
     for row in rows:
         if row.front == row.back and row.front in highlight:
             late = row.beam_width > np.sqrt(min(width) * max(width))
+            ax.plot(
+                row.beam_width,
+                row.field_edge / 1000,
+                "o",
+                color="none",
+                markersize=10,
+                markeredgecolor="k",
+                markeredgewidth=1,
+            )
             ax.annotate(
                 f"two {row.front}, f = {row.effective_focal_length:.1f} mm",
                 (row.beam_width, row.field_edge / 1000),

@@ -46,7 +46,8 @@ def _collimator(figure: Figure) -> str:
     plots.plot_system(collimating_pair(), "y", sources, figure.subplots(), sensor_dist=3 + COVER)
     return (
         "The collimating pair, across the pixel line; a ray that misses a lens ends there. "
-        "The second source is at the margin of claim O11 (figure 4.3)."
+        "Paraxial rays bend at vertex planes. The second source is at the margin of claim O11 "
+        "(figure 4.3)."
     )
 
 
@@ -68,7 +69,10 @@ def _rays(figure: Figure) -> str:
 def _lenses(figure: Figure) -> str:
     named = ("LJ1695L1", "LJ1430L1", "LJ1567L1", "LJ1516L1")
     plots.plot_lens_comparison(lens_selection(), figure.subplots(), highlight=named)
-    return "Every pair of the catalogue's 30 mm lenses: only the focal length counts."
+    return (
+        "Every pair of the catalogue's 30 mm lenses, near is 0.5 m and far 5 m: paraxially only the "
+        "focal length counts."
+    )
 
 
 def _beam(figure: Figure) -> str:
@@ -84,7 +88,7 @@ def _resolution(figure: Figure) -> str:
     left, right = figure.subplots(1, 2)
     plots.plot_resolution(resolution, left)
     plots.plot_resolution(resolution, right, quantity="axial")
-    return "What one pixel is worth, sideways and toward the LEDs."
+    return "What one pixel is worth, sideways and toward the LEDs; white where fewer than two are seen."
 
 
 def _head(figure: Figure) -> str:
@@ -92,6 +96,8 @@ def _head(figure: Figure) -> str:
     along, across = figure.subplots(1, 2)
     plots.plot_system(head, "x", [(FAR, 0), (FAR, 1500)], along, width=28)
     plots.plot_system(head, "y", [(FAR, 0), (FAR, 1500)], across)
+    along.set_title("along the pixel line", loc="right")
+    across.set_title("across it", loc="right")
     effect = plate_effect(head)
     return (
         "The whole head, along and across the pixel line (figure 4.7). Glass between pair and "
@@ -127,7 +133,7 @@ def draw(name: str) -> tuple[bytes, str]:
 
 
 def write(folder: Path) -> Iterator[str]:
-    """Write all figures and report.html into a folder; yields the name of what comes next.
+    """Write all figures and report.html into a folder; yields the name of what was written.
 
     Parameters
     ----------
@@ -137,11 +143,11 @@ def write(folder: Path) -> Iterator[str]:
     pictures: dict[str, tuple[bytes, str]] = {}
     (folder / "figures").mkdir(parents=True, exist_ok=True)
     for name in FIGURES:
-        yield name
         pictures[name] = draw(name)
         (folder / "figures" / f"{name}.png").write_bytes(pictures[name][0])
-    yield "report.html"
+        yield name
     (folder / "report.html").write_text(page(claims(), pictures), encoding="utf-8")
+    yield "report.html"
 
 
 def page(table: ClaimTable, pictures: dict[str, tuple[bytes, str]]) -> str:

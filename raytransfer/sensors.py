@@ -79,16 +79,29 @@ class LineSensor:
 
 
 def _sensors() -> dict[str, LineSensor]:
-    result = {}
+    result: dict[str, LineSensor] = {}
     for file in sorted((FOLDER / "sensors").iterdir(), key=lambda file: file.name):
-        entry = read(file)
-        window = entry.pop("window", None)
-        if window is not None:
-            entry["top_to_chip"] = window["top_to_chip"]
-            material = MATERIALS[window["material"]]
-            entry["window"] = Plate(f"{entry['name']} window", window["thickness"], material)
-        result[entry["name"]] = LineSensor(**entry)
+        if not file.name.endswith(".toml"):
+            continue
+        try:
+            sensor = _sensor(read(file))
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"{file.name}: {error} (see tcd1304.toml for what is needed)"
+            ) from error
+        if sensor.name in result:
+            raise ValueError(f"{file.name}: there is a sensor named {sensor.name} already")
+        result[sensor.name] = sensor
     return result
+
+
+def _sensor(entry: dict[str, Any]) -> LineSensor:
+    window = entry.pop("window", None)
+    if window is not None:
+        entry["top_to_chip"] = window["top_to_chip"]
+        material = MATERIALS[window["material"]]
+        entry["window"] = Plate(f"{entry['name']} window", window["thickness"], material)
+    return LineSensor(**entry)
 
 
 SENSORS = MappingProxyType(_sensors())

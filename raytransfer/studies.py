@@ -254,6 +254,11 @@ class PairStudy:
     lateral_resolution: float
 
 
+def covers(lens: Lens, sensor: LineSensor) -> bool:
+    """Whether a lens is convex and as high as the sensor is long."""
+    return lens.radius > 0 and lens.height >= sensor.length
+
+
 def lens_selection(
     lenses: Iterable[Lens] | None = None,
     *,
@@ -278,15 +283,16 @@ def lens_selection(
     sensor : LineSensor
     """
     if lenses is None:
-        lenses = [
-            lens for lens in CATALOGUE.values() if lens.radius > 0 and lens.height >= sensor.length
-        ]
+        lenses = [lens for lens in CATALOGUE.values() if covers(lens, sensor)]
         if not lenses:
             raise ValueError(
                 f"no lens of the catalogue is as high as the {sensor.name} is long "
                 f"({sensor.length:g} mm); give lenses="
             )
     lenses = list(lenses)
+    for lens in lenses:
+        if lens.radius < 0:
+            raise ValueError(f"{lens.part} is concave: pairs of convex lenses are studied")
     half_length = sensor.length / 2
     rows = []
     for front, back in product(lenses, repeat=2):

@@ -85,6 +85,9 @@ class OpticalSystem:
         object.__setattr__(self, "gaps", tuple(self.gaps))
         if not self.elements:
             raise ValueError(f"{self.name}: a system has at least one element")
+        for element in self.elements:
+            if not isinstance(element, Element):
+                raise TypeError(f"{self.name}: {element!r} is neither a Lens nor a Plate")
         if len(self.gaps) != len(self.elements) - 1:
             raise ValueError(
                 f"{self.name}: {len(self.elements)} elements have {len(self.elements) - 1} gaps "
@@ -175,7 +178,8 @@ class OpticalSystem:
     ) -> CardinalPoints:
         """Return focal, principal and nodal points in one meridian."""
         m = self.matrix(meridian, plates=plates, wavelength=wavelength)
-        if m.C == 0:
+        # what floating point leaves of C where the lenses of a telescope cancel
+        if m.C == 0 or 0 < abs(m.B * m.C) < 1e-12 * abs(m.A * m.D):
             return CardinalPoints(*[math.inf] * 5)
         # Hecht, Optics, section 6.2, for a matrix that acts on (height, angle) in air
         return CardinalPoints(
@@ -275,7 +279,7 @@ def prototype_head(
         Height in mm above the window's top of each element's lower vertex (figure 4.7, section
         4.2.1).
     concave_to_pair : float
-        Air in mm between the concave lens and the pair. With the thesis's lenses the remaining
+        Air in mm between the concave lens and the pair (section 4.2.1). With the thesis's lenses the remaining
         40 − 2.63 − 25.4 − 2 × 5.9 leave 0.17 mm between the pair.
     """
     if sensor.window is None or sensor.top_to_chip is None:

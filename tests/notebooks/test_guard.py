@@ -100,6 +100,13 @@ in_source = partial(changed, "source")
 in_output = partial(changed, "outputs")
 
 
+def without_widgets(text: str) -> str:
+    """The notebook as JupyterLab saves it unless told to keep the widgets' state."""
+    notebook = json.loads(text)
+    del notebook["metadata"]["widgets"]
+    return json.dumps(notebook)
+
+
 def never_run(text: str) -> str:
     """The notebook with a cell that was saved before it ran."""
     notebook = json.loads(text)
@@ -125,6 +132,7 @@ MUTATIONS = {
     "LaTeX": (in_output("sqrt{x}", "sqrt{y}"), "mismatch 'text/latex'"),
     "printed line": (in_output("29.8077 mm", "29.8078 mm"), "mismatch 'stdout'"),
     "figure": (in_source("[0, 1], [0, 1]", "[0, 1], [0, 0.95]"), "figure 1 differs"),
+    "colour of a line": (in_source("[0, 1], [0, 1]", "[0, 1], [0, 1], 'C1'"), "figure 1 differs"),
     "figure is gone": (in_source("ax.plot([0, 1], [0, 1])", "plt.close()"), "Missing output"),
     "slider default": (in_source("value=3", "value=2"), "mismatch 'text/plain'"),
     "slider default inside a widget": (in_source("=2000", "=2010"), "Widgets differ"),
@@ -141,6 +149,19 @@ MUTATIONS = {
         in_source('change[\\"new\\"])', 'change[\\"new\\"] // (change[\\"new\\"] == 4) * 1)'),
         "ZeroDivisionError",
     ),
+    "error when the sensor is let go": (
+        in_source(
+            "Explorer(source_dist=2000)",
+            "Explorer(source_dist=2000)\\n"
+            "explorer.sensor_dist.observe(lambda c: 1 / explorer.focus.value, 'value')",
+        ),
+        "ZeroDivisionError",
+    ),
+    "cell that is skipped": (
+        in_source("print(", "#NBVAL_IGNORE_OUTPUT\\nprint("),
+        "would leave this cell unchecked",
+    ),
+    "widgets that were not saved": (without_widgets, "Widgets were not saved"),
     "cell that never ran": (never_run, "saved without having run"),
 }
 

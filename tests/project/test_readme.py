@@ -39,3 +39,9 @@ def test_links_and_commands_exist() -> None:
 def test_every_notebook_is_listed() -> None:
     for path in (ROOT / "notebooks").glob("*.ipynb"):
         assert f"(notebooks/{path.name})" in README
+
+
+def test_notebooks_carry_every_claim() -> None:
+    sources = "".join(path.read_text() for path in (ROOT / "notebooks").glob("*.ipynb"))
+    shown = re.findall(r"\| (O\d+) \|", sources)
+    assert sorted(shown) == sorted(claim.id for claim in claims())  # each in one notebook

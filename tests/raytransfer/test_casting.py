@@ -15,10 +15,14 @@ from hypothesis.extra.numpy import BroadcastableShapes, mutually_broadcastable_s
 from numpy.testing import assert_allclose, assert_array_equal
 
 from raytransfer import (
+    MATERIALS,
+    Lens,
     RayMatrix,
     cast_rays,
     cast_rays_to_focal_length,
     collimating_pair,
+    flat_mat,
+    input_vec,
     prototype_head,
     refract_mat,
     telecentric_pair,
@@ -71,6 +75,13 @@ def exact_crossing(
     return float(x), float(h1 + x * u1)
 
 
+def to_the_nanometre(length: float) -> float:
+    return round(length, 6)
+
+
+gaps = st.floats(0, 40).map(to_the_nanometre)
+
+
 @st.composite
 def matrices(draw: st.DrawFn) -> NDArray[np.float64]:
     """Two thick lenses and the air between them, multiplied here."""
@@ -80,13 +91,13 @@ def matrices(draw: st.DrawFn) -> NDArray[np.float64]:
         for before, after in ((1.0, n), (n, 1.0)):
             radius = draw(st.floats(10, 500)) * draw(st.sampled_from([-1, 1]))
             m = np.array([[1, 0], [(before - after) / (radius * after), before / after]]) @ m
-            m = np.array([[1, draw(st.floats(0, 40))], [0, 1]]) @ m
+            m = np.array([[1, draw(gaps)], [0, 1]]) @ m
     return m
 
 
 widths = st.floats(0.1, 60)
 source_dists = st.floats(1, 20_000)
-offsets = st.floats(-3000, 3000).map(lambda offset: round(offset, 6))
+offsets = st.floats(-3000, 3000).map(to_the_nanometre)
 
 
 def assume_no_cancellation(abcd: Any, dist: float) -> None:
@@ -183,7 +194,7 @@ def test_a_ball_lens() -> None:
 
 
 @settings(deadline=None)
-@given(widths, matrices(), source_dists, offsets, st.floats(-500, 500))
+@given(widths, matrices(), source_dists, offsets, st.floats(-500, 500).map(to_the_nanometre))
 def test_edge_rays_on_a_plane(
     width: float, abcd: NDArray[np.float64], dist: float, off: float, length: float
 ) -> None:
@@ -446,5 +457,28 @@ def test_a_matrix_of_anything_but_real_numbers_is_refused(
 
 @pytest.mark.parametrize("function", BOTH)
 def test_shapes_that_do_not_fit_are_refused(function: Callable[..., Any]) -> None:
-    with pytest.raises(ValueError, match=r"broadcast together with shapes"):
+    with pytest.raises(ValueError, match=r"source_dist \(2,\), axis_off \(3,\).*\[:, None\]"):
         call(function, source_dist=[1.0, 2.0], axis_off=[1.0, 2.0, 3.0])
+
+
+@pytest.mark.parametrize(
+    ("mistake", "hint"),
+    [
+        (lambda: cast_rays(-30, np.eye(2), 5000, 0), "full aperture of the lens in mm"),
+        (lambda: cast_rays(30, np.eye(2), -5000, 0), "the source stands in front of the lens"),
+        (lambda: trans_mat(math.inf), "a distance in mm"),
+        (lambda: input_vec(1, math.nan), "not in degrees"),
+        (lambda: flat_mat(math.nan, 1), "a refractive index is 1 or more"),
+        (lambda: refract_mat(1 / 1.52, 1, 31), "the ratio of two indices"),
+        (lambda: refract_mat(1, 1.52, 0), "a plane is flat_mat"),
+        (
+            lambda: Lens("a", 30, 32, 31, -5.9, MATERIALS["N-BK7"]),
+            "the sign of a concave lens belongs to its radius",
+        ),
+        (lambda: Lens("a", 30, 32, 14, 5.9, MATERIALS["N-BK7"]), "was the focal length"),
+        (lambda: telecentric_pair(gap=-1), "cannot overlap"),
+    ],
+)
+def test_refusals_name_the_likely_mistake(mistake: Callable[[], object], hint: str) -> None:
+    with pytest.raises(ValueError, match=hint):
+        mistake()

@@ -70,7 +70,7 @@ def test_results_are_the_studies(
     position = image_position(matrix, source_dist, axis_off, chip)
     pixel = position / 0.008 + 1823.5
     where = f"pixel {pixel:.1f}" if abs(position) <= HALF else "off the sensor"
-    leds = 300 * np.arange(-10, 11)
+    leds = 300 * np.arange(-100, 101)  # a long line
     expected = {
         "focus of this source": f"{cast_rays(30, matrix, source_dist, 0).focal_length:.3f} mm "
         "behind the lenses",
@@ -201,6 +201,10 @@ def test_the_picture_shows_the_rays(shared: Explorer) -> None:
         assert height == pytest.approx(focus.focal_offset, rel=1e-9)
     assert_array_equal(drawing._line.get_xdata(), [view.system.length + view.sensor_dist] * 2)
     assert_array_equal(drawing._line.get_ydata(), [-HALF, HALF])
+    # and the axis reaches a little further than the sensor
+    chip = view.system.length + view.sensor_dist
+    assert drawing._optics.get_xlim()[0] < 0
+    assert chip < drawing._optics.get_xlim()[1] < 2 * chip
     edge = field_edge(view.matrix, 2000, HALF, view.sensor_dist)
     corners = 1000 * drawing._field.get_xy()
     assert corners[:3].tolist() == pytest.approx(
@@ -310,3 +314,19 @@ def test_lenses_that_are_not_offered_are_refused(name: str, bad: str) -> None:
     settings: Any = {name: bad}
     with pytest.raises(ValueError, match=bad):
         Explorer(**settings)
+
+
+@pytest.mark.parametrize("source_dist", [1500.0, 3000.0, 4300.0, 6000.0])
+@pytest.mark.parametrize("axis_off", [-3000.0, -1234.0, 0.0, 2990.0, 3000.0])
+@pytest.mark.parametrize("led_spacing", [100.0, 730.0, 2000.0])
+def test_two_leds_are_seen_from_the_start_of_tracking_on(
+    shared: Explorer, source_dist: float, axis_off: float, led_spacing: float
+) -> None:
+    """Also at the edge of the room: the line of LEDs is long, the picture shows a part of it."""
+    moved = {"source_dist": source_dist, "axis_off": axis_off, "led_spacing": led_spacing}
+    put(shared, {**SETTINGS, **moved})
+    view = shared.view()
+    if source_dist >= view.tracking_start:
+        assert view.seen.sum() >= 2
+    inside = 2 * view.field_edge / led_spacing
+    assert abs(view.seen.sum() - inside) <= 1

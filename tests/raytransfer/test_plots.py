@@ -262,6 +262,9 @@ def test_focus_is_where_it_says(dist: float, where: str, magnify: float, ax: Axe
         x, y = data(ray)
         assert np.interp(0, x, y) == height
         assert np.interp(shown, x, y) == pytest.approx(0, abs=1e-12)
+        # straight through the focus to the right edge
+        slopes = np.diff(y) / np.diff(x)
+        assert slopes[-1] == pytest.approx(slopes[-2], rel=1e-12)
         # from the source: the first piece points to it
         assert y[0] - (x[0] + dist) * (y[1] - y[0]) / (x[1] - x[0]) == pytest.approx(0, abs=1e-9)
         assert (np.diff(x) > 0).all()
@@ -480,7 +483,8 @@ def test_resolution_shows_the_maps_values(quantity: str, ax: Axes) -> None:
     assert_array_equal(values.compressed(), expected[~np.isnan(expected)])
     assert np.isnan(expected).any()
     (bar,) = (other for other in ax.figure.axes if other is not ax)
-    assert bar.get_ylabel() == f"{quantity} resolution (mm per pixel)"
+    direction = {"lateral": "sideways", "axial": "toward the LEDs"}[quantity]
+    assert bar.get_ylabel() == f"{direction} (mm per pixel)"
     vmax = mesh.norm.vmax
     assert vmax is not None
     assert vmax >= np.nanmax(expected)  # no value is off the scale

@@ -259,6 +259,24 @@ def test_a_system_without_power_has_its_points_at_infinity(system: OpticalSystem
     assert system.back_focal_length(without) == math.inf
 
 
+def lens_power(lens: Lens) -> float:
+    return (lens.material.index() - 1) / lens.radius
+
+
+def test_a_telescope_has_its_points_at_infinity_in_spite_of_rounding() -> None:
+    """Galilei's: the focal points of a concave and a convex lens coincide."""
+    concave, convex = THESIS_LENSES["PCV_15_30_20"], CATALOGUE["LJ1430L1"]
+    # C = −(p1 + p2 − p1 p2 (gap + t/n)) for powers p and the concave lens's thickness t
+    p1, p2 = (lens_power(lens) for lens in (concave, convex))
+    gap = (p1 + p2) / (p1 * p2) - concave.thickness / 1.52
+    telescope = collimating_pair(concave, convex, gap)
+    assert abs(telescope.matrix("y").C) < 1e-15
+    assert telescope.effective_focal_length("y") == math.inf
+    assert telescope.back_focal_length("y") == math.inf
+    nearly = collimating_pair(concave, convex, gap + 1e-6)
+    assert math.isfinite(nearly.effective_focal_length("y"))
+
+
 def test_focal_lengths_depend_on_colour_and_plates() -> None:
     pair = telecentric_pair("LJ1430L1")
     n = MATERIALS["N-BK7"].index(0.45)
