@@ -45,3 +45,12 @@ def test_notebooks_carry_every_claim() -> None:
     sources = "".join(path.read_text() for path in (ROOT / "notebooks").glob("*.ipynb"))
     shown = re.findall(r"\| (O\d+) \|", sources)
     assert sorted(shown) == sorted(claim.id for claim in claims())  # each in one notebook
+
+
+def test_every_benchmark_is_in_the_table() -> None:
+    assert "@@" not in README
+    sources = "".join(path.read_text() for path in (ROOT / "benchmarks").glob("bench_*.py"))
+    names = re.findall(r'Result\(\s*"([^"]+)"', sources)
+    assert len(names) >= 10
+    for name in names:
+        assert f"| {name} |" in README
