@@ -41,10 +41,14 @@ def executed(path: Path) -> str:
     for number, cell in enumerate(notebook.cells, start=1):
         cell.id = f"cell-{number:02d}"
         cell.metadata = {key: value for key, value in cell.metadata.items() if key == "tags"}
+        if cell.cell_type == "code":
+            cell.outputs = _joined(cell.outputs)
         for output in cell.get("outputs", ()):
             _refuse(path, number, output)
     widgets = notebook.metadata.get("widgets", {}).get(WIDGET_STATE, {}).get("state", {})
     for model in widgets.values():
+        if "outputs" in model["state"]:
+            model["state"]["outputs"] = _joined(model["state"]["outputs"])
         for output in model["state"].get("outputs", ()):
             _refuse(path, 0, output)
     notebook.metadata = {
@@ -57,6 +61,21 @@ def executed(path: Path) -> str:
         **({"widgets": notebook.metadata["widgets"]} if widgets else {}),
     }
     return _renumbered(nbformat.writes(notebook), list(widgets))
+
+
+def _joined(outputs: list[Any]) -> list[Any]:
+    """Join what was printed: the kernel sends it in pieces, divided by the clock."""
+    joined: list[Any] = []
+    streams: dict[str, Any] = {}
+    for output in outputs:
+        name = output.get("name")
+        if output["output_type"] == "stream" and name in streams:
+            streams[name]["text"] += output["text"]
+            continue
+        if output["output_type"] == "stream":
+            streams[name] = output
+        joined.append(output)
+    return joined
 
 
 def _refuse(path: Path, number: int, output: dict[str, Any]) -> None:

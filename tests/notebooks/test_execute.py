@@ -29,6 +29,17 @@ def test_two_runs_give_the_same_bytes(tmp_path: Path) -> None:
     assert execute("--check", path).returncode == 0
 
 
+def test_pieces_of_text_are_joined(tmp_path: Path) -> None:
+    """What is printed slowly comes in pieces; how many is up to the clock."""
+    path = tmp_path / "slow.ipynb"
+    source = "import time\nfor n in range(3):\n    print(n, flush=True)\n    time.sleep(0.5)\n    display(n)"
+    nbformat.write(new_notebook(cells=[new_code_cell(source)]), path)
+    assert execute(path).returncode == 0
+    outputs = nbformat.read(path, as_version=4).cells[0].outputs
+    assert [output.output_type for output in outputs] == ["stream", *["display_data"] * 3]
+    assert outputs[0].text == "0\n1\n2\n"
+
+
 def test_check_notices_and_does_not_write(tmp_path: Path) -> None:
     path = tmp_path / "one.ipynb"
     nbformat.write(new_notebook(cells=[new_code_cell("1 + 1")]), path)
