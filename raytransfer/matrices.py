@@ -52,7 +52,7 @@ class RayMatrix:
         If an element is not finite, or the determinant is not n1/n2 (to one part in 10⁹).
     """
 
-    __slots__ = ("_abcd", "n1", "n2")
+    __slots__ = ("_abcd", "_n1", "_n2")
 
     # numpy leaves `array * matrix` to __rmul__ and refuses `np.multiply(matrix, ...)`
     __array_ufunc__ = None
@@ -65,8 +65,8 @@ class RayMatrix:
             raise ValueError(f"a ray matrix has shape (2, 2), not {values.shape}")
         if (n1 is None) != (n2 is None):
             raise ValueError(f"n1 = {n1}, n2 = {n2}: give both refractive indices or neither")
-        self.n1 = None if n1 is None else check.refractive_index("n1", n1)
-        self.n2 = None if n2 is None else check.refractive_index("n2", n2)
+        self._n1 = None if n1 is None else check.refractive_index("n1", n1)
+        self._n2 = None if n2 is None else check.refractive_index("n2", n2)
         (a, b), (c, d) = values
         size = abs(a * d) + abs(b * c)
         if not abs(a * d - b * c - self.determinant) <= 1e-9 * size < math.inf:
@@ -77,6 +77,16 @@ class RayMatrix:
             )
         values.setflags(write=False)
         self._abcd = values
+
+    @property
+    def n1(self) -> float | None:
+        """Refractive index before; None for an unnamed medium."""
+        return self._n1
+
+    @property
+    def n2(self) -> float | None:
+        """Refractive index behind; None for an unnamed medium."""
+        return self._n2
 
     @property
     def determinant(self) -> float:

@@ -1,4 +1,7 @@
-"""The thesis's design studies (sections 4.2.1 and 5.3): functions that return labelled results.
+"""The thesis's design studies (sections 4.2.1 and 5.3): functions that print nothing.
+
+A single quantity comes as a number, or an array for arrays, in the unit that the docstring names;
+what has several parts comes as a dataclass that labels them.
 
 All of it is paraxial. `lens_mat` is the matrix of what lies between light and sensor in the
 meridian under study; `sensor_dist` is the distance in mm from its last vertex to the chip. Where
