@@ -213,7 +213,7 @@ def plot_focus(
     )
     _axis(ax)
     if magnify != 1:
-        ax.set_xlabel("along the axis (mm; not to scale behind the lenses)")
+        ax.set_xlabel("along the axis (mm), focus not to scale")
     return ax
 
 
