@@ -134,6 +134,8 @@ class RayMatrix:
         ------
         TypeError
             If `rays` does not have two rows of real numbers.
+        ValueError
+            If `out` has another shape.
         """
         array = np.asarray(rays)
         if array.ndim == 0 or array.shape[0] != 2 or array.dtype.kind not in "iuf":
