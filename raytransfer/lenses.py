@@ -138,6 +138,11 @@ class Lens:
         """Depth in mm of the curved side at y mm from the axis; negative where it is hollow."""
         return math.copysign(abs(self.radius) - math.sqrt(self.radius**2 - y**2), self.radius)
 
+    def size(self, meridian: Meridian) -> float:
+        """Full aperture in one meridian, mm."""
+        check_meridian("meridian", meridian)
+        return self.height if meridian == self.bends else self.length
+
     def focal_length(self, wavelength: float = D_LINE) -> float:
         """Effective focal length of the lens alone, in mm: R/(n − 1)."""
         return self.radius / (self.material.index(wavelength) - 1)

@@ -322,7 +322,7 @@ def plot_system(
 def _half_size(element: Element, meridian: Meridian, window: float) -> float:
     if not isinstance(element, Lens):
         return window
-    return (element.height if element.bends == meridian else element.length) / 2
+    return element.size(meridian) / 2
 
 
 def _draw_sensor(ax: Axes, z: float, half: float) -> None:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from raytransfer import _checks as check
 from raytransfer._data import FOLDER, read
@@ -13,6 +16,47 @@ from raytransfer.materials import MATERIALS
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
+
+
+@dataclass(frozen=True)
+class SpectralResponse:
+    """How many electrons a photon leaves in a pixel.
+
+    Parameters
+    ----------
+    wavelengths : tuple of float
+        µm, rising.
+    relative : tuple of float
+        Response to equal power there, relative to its largest value.
+    peak_quantum_efficiency : float
+        Electrons per photon at the wavelength of the largest response, 0 to 1.
+    """
+
+    wavelengths: tuple[float, ...]
+    relative: tuple[float, ...]
+    peak_quantum_efficiency: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "wavelengths", tuple(self.wavelengths))
+        object.__setattr__(self, "relative", tuple(self.relative))
+        if len(self.wavelengths) != len(self.relative) or len(self.wavelengths) < 2:
+            raise ValueError("a response needs as many relative values as wavelengths, 2 or more")
+        if any(b <= a for a, b in pairwise(self.wavelengths)):
+            raise ValueError(f"wavelengths of a response rise; {self.wavelengths} do not")
+        if not 0 < check.number("peak_quantum_efficiency", self.peak_quantum_efficiency) <= 1:
+            raise ValueError(
+                f"peak_quantum_efficiency = {self.peak_quantum_efficiency:g}: allowed is > 0 to 1; "
+                "was it given in percent?"
+            )
+
+    def quantum_efficiency(self, wavelength: ArrayLike) -> NDArray[Any]:
+        """Electrons per photon at wavelengths in µm; 0 outside the charted ones."""
+        wavelength = check.array("wavelength", wavelength)
+        relative = np.interp(wavelength, self.wavelengths, self.relative, left=0.0, right=0.0)
+        peak = self.wavelengths[int(np.argmax(self.relative))]
+        # the chart is per power: a shorter wave brings fewer photons
+        efficiency = self.peak_quantum_efficiency * relative * peak / wavelength
+        return np.asarray(efficiency)
 
 
 @dataclass(frozen=True)
@@ -32,6 +76,8 @@ class LineSensor:
         The glass over the chip; None if unknown.
     top_to_chip : float, optional
         From the window's outer face to the pixels, mm.
+    response : SpectralResponse, optional
+        None if unknown.
     """
 
     name: str
@@ -42,6 +88,7 @@ class LineSensor:
     trailing_elements: int | None = None
     window: Plate | None = None
     top_to_chip: float | None = None
+    response: SpectralResponse | None = None
 
     def __post_init__(self) -> None:
         check.whole(f"pixels of {self.name}", self.pixels)
@@ -101,6 +148,8 @@ def _sensor(entry: dict[str, Any]) -> LineSensor:
         entry["top_to_chip"] = window["top_to_chip"]
         material = MATERIALS[window["material"]]
         entry["window"] = Plate(f"{entry['name']} window", window["thickness"], material)
+    if "response" in entry:
+        entry["response"] = SpectralResponse(**entry["response"])
     return LineSensor(**entry)
 
 

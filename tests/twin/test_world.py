@@ -1,0 +1,79 @@
+"""The room's light in electrons, and what bad rooms are told."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from raytransfer import TCD1304
+from raytransfer.illumination import pixel_solid_angles
+from twin.world import Led, Pose, World, two_leds
+
+
+def test_the_default_room_is_the_documented_one() -> None:
+    world = World()
+    assert [led.position for led in world.leds] == [(-250, 0, 0), (250, 0, 0)]
+    assert world.pose() == Pose(0, 1300, 0)
+    assert world.ambient_rate() == 0
+    assert not world.moving
+
+
+def test_default_leds_fill_some_60_percent_of_the_well_in_25_us() -> None:
+    rates = World().rates()
+    assert 30_000 < rates[:2].max() * 25e-6 < 42_000
+    assert not rates[2:].any()
+
+
+def test_power_becomes_electrons() -> None:
+    """By hand: W/sr times sr, over the photon's energy, times quantum efficiency."""
+    led = Led(5, (0, 0, 0), power=1.0, wavelength=0.55)
+    rates = World(leds=[led]).rates()[5]
+    angles = pixel_solid_angles(World().head, (0, 0, 1300))
+    photon = 6.62607015e-34 * 299792458 / 550e-9
+    assert rates == pytest.approx(angles / np.pi / photon * 0.8, rel=1e-9)
+
+
+def test_leds_are_lambertian_and_dark_behind() -> None:
+    led = Led(0, (0, 0, 0), power=np.pi)
+    assert led.intensity(0, 1000, 0) == pytest.approx(1)
+    assert led.intensity(1000, 1000, 0) == pytest.approx(np.sqrt(0.5))
+    assert led.intensity(0, -1000, 0) == 0
+    assert Led(0, (0, 0, 0), power=np.pi, facing=np.pi / 2).intensity(-5, 0, 0) == pytest.approx(1)
+
+
+def test_turning_left_moves_the_spike_as_an_led_to_the_right_does() -> None:
+    """Counter-clockwise seen from above, looking along −y: the line moves to optical +X."""
+    still, turned = World().rates()[0], World(tracker=Pose(0, 1300, 0.1)).rates()[0]
+    pixels = np.arange(TCD1304.pixels)
+    moved = np.average(pixels, weights=turned) - np.average(pixels, weights=still)
+    assert abs(moved) > 300
+    led = World().leds[0]
+    before = World().seen_from(led, Pose(0, 1300))[0]
+    after = World().seen_from(led, Pose(0, 1300, 0.1))[0]
+    assert np.sign(moved) == -np.sign(after - before)  # inverted image
+
+
+def test_a_trajectory_is_followed() -> None:
+    world = World(tracker=lambda seconds: Pose(100 * seconds, 1300))
+    assert world.moving
+    assert world.pose(2.0).x == 200
+    assert not np.array_equal(world.rates(0.0), world.rates(1.0))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda: Led(64, (0, 0, 0)), "allowed are 0 to 63"),
+        (lambda: Led(0, (0, 0)), "x, y and z"),  # type: ignore[arg-type]
+        (lambda: Led(0, (0, np.nan, 0)), "finite"),
+        (lambda: Led(0, (0, 0, 0), power=-1), "power"),
+        (lambda: Led(0, (0, 0, 0), wavelength=630), "given in nm"),
+        (lambda: World(leds=[*two_leds(), *two_leds()]), "each may be used once"),
+        (lambda: World(ambient=-1), "ambient"),
+        (lambda: Pose(0, np.inf), "finite"),
+    ],
+)
+def test_a_wrong_room_is_refused(wrong: object, message: str) -> None:
+    assert callable(wrong)
+    with pytest.raises(ValueError, match=message):
+        wrong()
