@@ -1,0 +1,575 @@
+"""Capture: a command goes out, frames come in, and what happens on the wire is dealt with.
+
+>>> from acquisition.capture import capture
+>>> from acquisition.links import open_link
+>>> from acquisition.protocol import Command
+>>> with open_link("twin") as link:  # doctest: +SKIP
+...     frames = list(capture(link, Command(sh_period=100, icg_period=30000, count=2)))
+"""
+
+from __future__ import annotations
+
+import time
+from contextlib import closing, suppress
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Final, Literal, Self
+
+from acquisition.frames import MASTER_CLOCK, Frame, FrameFlags
+from acquisition.links import Link, LinkEnded, LinkError, LinkTimeout, pause
+from acquisition.protocol import (
+    ORIGINAL_SIZE,
+    STREAM_SIZE,
+    BadHeader,
+    BadVersion,
+    Command,
+    DecodeError,
+    Mode,
+    Refusal,
+    Status,
+    decode_elements,
+    decode_frame,
+)
+from acquisition.wiring import PROTOCOL
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+    from types import TracebackType
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+Firmware = Literal["linetrack", "original"]
+
+_SLACK: Final = 0.25  # s; far more than a busy host needs to look at the line
+_FLUSH: Final = PROTOCOL.flush_icg * PROTOCOL.flush_pulses  # clocks
+_PERIODS: Final = 6  # read-outs that may pass between command and first frame
+_QUIET: Final = 2e-6 * PROTOCOL.stream.stall_us  # s; the device gives a transfer up in half
+_BREATH: Final = 1e-4  # s; after a transfer, until the device can take one that it did not offer
+_RESET: Final = 1.2e-6 * PROTOCOL.stream.original_stall_us  # s; in original mode, too
+_FRUITLESS: Final = 8  # transfers without a good frame before the command is sent again
+_UNCONFIRMED: Final = 8  # frames until a command that nothing came of is sent again
+_SEQUENCES: Final = 1 << 32
+_ZEROS: Final = {size: bytes(size) for size in (ORIGINAL_SIZE, STREAM_SIZE)}
+
+
+class Refused(LinkError):  # noqa: N818
+    """The device refuses the command.
+
+    Parameters
+    ----------
+    reason : Refusal or None
+        None: it does not say why.
+    detail : str
+    """
+
+    def __init__(self, reason: Refusal | None, detail: str) -> None:
+        super().__init__(reason, detail)
+        self.reason = reason
+        self.detail = detail
+
+    def __str__(self) -> str:
+        why = "it gives no reason" if self.reason is None else self.reason.name.lower()
+        return f"the device refuses the command ({why}): {self.detail}"
+
+
+@dataclass
+class CaptureStatistics:
+    """What a capture has met so far.
+
+    Parameters
+    ----------
+    good : int
+        Frames delivered without complaint.
+    invalid : int
+        Original mode: frames delivered with the flag `FrameFlags.INVALID`.
+    dropped : int
+        Stream mode: read-outs missing in the sequence, lost by the device or on the link.
+    corrupt : int
+        Stream mode: transfers that arrived damaged; none of them is delivered.
+    stale : int
+        Stream mode: frames of an earlier command, or sent twice; not delivered either.
+    timeouts : int
+        Times the device did not offer anything in time.
+    restarts : int
+        Commands sent again.
+    """
+
+    good: int = 0
+    invalid: int = 0
+    dropped: int = 0
+    corrupt: int = 0
+    stale: int = 0
+    timeouts: int = 0
+    restarts: int = 0
+
+
+def capture(link: Link, command: Command, **options: Any) -> Iterator[Frame]:
+    """Send a command and yield the frames that answer it.
+
+    Parameters
+    ----------
+    link : Link
+        Stays open. In which mode the device is does not matter.
+    command : Command
+    **options
+        Those of `Capture`.
+
+    Yields
+    ------
+    Frame
+        In original mode every one of them, those that contradict themselves with
+        `FrameFlags.INVALID`; in stream mode only good ones.
+
+    Raises
+    ------
+    LinkTimeout
+        Nothing comes, in spite of repeated commands.
+    Refused
+        The device does not take the command.
+    LinkError
+        From the link.
+    """
+    frames = Capture(link, command, **options)
+    return _closing(frames)
+
+
+def _closing(frames: Capture) -> Iterator[Frame]:
+    with closing(frames):
+        yield from frames
+
+
+class Capture:
+    """A capture under way: an iterator of frames that can be looked at and steered meanwhile.
+
+    Used in a ``with`` statement it is closed in any case: a device in the middle of an endless
+    stream is told to stop. The link stays open.
+
+    Parameters
+    ----------
+    link : Link
+        In which mode the device is does not matter.
+    command : Command
+    timeout : float, optional
+        How long the device may be silent, s. By default six read-outs and a flush, and a quarter
+        of a second for the host.
+    retries : int, optional
+        How often a command is sent again before the capture fails. Counted anew after each good
+        frame.
+    firmware : {"linetrack", "original"}, optional
+        "original": the published one, which sends one frame more than asked for.
+    master_clock : float, optional
+        Of the sensor, Hz; by default the link's, or the prototype's.
+    on_corrupt : callable, optional
+        Called with the `DecodeError` of each damaged transfer in stream mode.
+
+    Attributes
+    ----------
+    statistics : CaptureStatistics
+    status : Status or None
+        Stream mode: the device's last answer to a command, with its firmware's build.
+
+    Raises
+    ------
+    ValueError
+        An option is out of its range.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        command: Command,
+        *,
+        timeout: float | None = None,
+        retries: int = 3,
+        firmware: Firmware = "linetrack",
+        master_clock: int | None = None,
+        on_corrupt: Callable[[DecodeError], None] | None = None,
+    ) -> None:
+        if timeout is not None and not timeout > 0:
+            raise ValueError(f"timeout = {timeout} s: allowed is > 0; None is a fitting one")
+        if retries < 0:
+            raise ValueError(f"retries = {retries}: allowed is >= 0")
+        if firmware not in ("linetrack", "original"):
+            raise ValueError(f"firmware = {firmware!r}: allowed are 'linetrack' and 'original'")
+        if firmware == "original" and command.mode is not Mode.ORIGINAL:
+            raise ValueError("firmware = 'original': it has no stream mode")
+        self.statistics = CaptureStatistics()
+        self.status: Status | None = None
+        self._link = link
+        self._firmware = firmware
+        default: int = getattr(link, "master_clock", MASTER_CLOCK)
+        self._clock = default if master_clock is None else master_clock
+        self._given_timeout = timeout
+        self._retries = retries
+        self._on_corrupt = on_corrupt
+        self._attempts = 0
+        self._number = -1  # of the last frame delivered
+        self._lost = False
+        # stream mode
+        self._command = command  # whose LED sequence is in force
+        self._pending: Command | None = None  # sent, without an answer yet
+        self._queued: Command | None = None  # to be sent with the next transfer
+        self._age = 0  # frames since the pending one was sent
+        self._tries = 0  # how often that was
+        self._doubtful = False  # its first frame may have been lost
+        self._fruitless = 0
+        self._started = False
+        self._running = False  # the device goes on by itself
+        self._expected: int | None = 0  # the next frame's sequence number; None: any
+        self._base: int | None = 0  # the frame that the LED sequence began with; None: unknown
+        self._settled = False  # a frame has come since the device's last (re)start
+        self._refusal: Refusal | None = None
+        self._frames = self._stream() if command.mode is Mode.STREAM else self._original()
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> Frame:
+        return next(self._frames)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the capture: an unfinished stream is stopped. The link stays open."""
+        self._frames.close()
+
+    @property
+    def command(self) -> Command:
+        """The command in force: the last one that the device has taken."""
+        return self._command
+
+    def send(self, change: Command | Sequence[Mapping[int, int]]) -> None:
+        """Change the running stream, with the next transfer; it is not interrupted.
+
+        The first frame exposed by it has `FrameFlags.CHANGED`. A command that is lost on the way
+        is sent again. One is under way at a time: of those given meanwhile, the last one follows.
+
+        Parameters
+        ----------
+        change : Command, or sequence of mapping of int to int
+            A new command, or only a new LED sequence as in `Command`. Frames go on being counted:
+            the capture ends after as many as it was begun for.
+
+        Raises
+        ------
+        CommandError
+            The sequence is not possible.
+        ValueError
+            The capture, or the command, is in original mode.
+        """
+        if self._command.mode is not Mode.STREAM:
+            raise ValueError("original mode takes one command for each capture; use stream mode")
+        if not isinstance(change, Command):
+            change = replace(self._newest(), sequence=change)
+        if change.mode is not Mode.STREAM:
+            raise ValueError(
+                "a running stream cannot go over to original mode; begin a new capture"
+            )
+        self._queued = change
+        if self._pending is None:
+            self._tries = 0
+
+    def _newest(self) -> Command:
+        return self._queued or self._pending or self._command
+
+    @property
+    def _timeout(self) -> float:
+        if self._given_timeout is not None:
+            return self._given_timeout
+        longest = max(self._command.icg_period, self._newest().icg_period)
+        return _SLACK + (_FLUSH + _PERIODS * longest) / self._clock
+
+    # --- original mode
+
+    def _original(self) -> Generator[Frame]:
+        command, total = self._command, self._command.count
+        before: NDArray[np.uint16] | None = None
+        with suppress(LinkEnded):
+            while self._number + 1 < total:
+                self._ask(total - self._number - 1)
+                while self._number + 1 < total and self._wait():
+                    elements = decode_elements(self._link.transfer(_ZEROS[ORIGINAL_SIZE]))
+                    frame = self._judged(command, elements, before)
+                    before = frame.elements
+                    self._attempts = 0
+                    yield frame
+
+    def _ask(self, count: int) -> None:
+        """Send the command for that many frames; not before the device has forgotten the last."""
+        if self._attempts:
+            self._again()
+        data = bytearray(replace(self._command, count=count).encode(ORIGINAL_SIZE))
+        if self._firmware == "original":  # it sends one more
+            data[11:13] = (count - 1).to_bytes(2, "big")
+        pause(self._link, _BREATH)
+        self._link.transfer(bytes(data))
+
+    def _wait(self) -> bool:
+        if self._link.wait_ready(self._timeout):
+            return True
+        self.statistics.timeouts += 1
+        self._attempts += 1
+        return False
+
+    def _again(self) -> None:
+        """Count a repetition of the command, and wait until the device is ready for it."""
+        if self._attempts > self._retries:
+            self._running = False
+            raise LinkTimeout(self._explanation())
+        self.statistics.restarts += 1
+        self._lost = True
+        pause(self._link, _RESET)
+
+    def _explanation(self) -> str:
+        found = self.statistics
+        if found.corrupt > found.timeouts:
+            return (
+                f"{found.corrupt} damaged transfers and no good one after the command was sent "
+                f"{self._attempts} times: check MISO, MOSI, SCLK and ground, keep the wires short, "
+                "and try a lower SPI clock; is this project's firmware on the microcontroller?"
+            )
+        return (
+            f"no frame within {self._timeout:.3g} s, though the command was sent "
+            f"{self._attempts} times: is the microcontroller powered and flashed, are PB2 and the "
+            "handshake input, MOSI, SCLK and ground wired as the README's table says, and is SPI "
+            "on (dtparam=spi=on in /boot/firmware/config.txt)?"
+        )
+
+    def _judged(
+        self, command: Command, elements: NDArray[np.uint16], before: NDArray[np.uint16] | None
+    ) -> Frame:
+        self._number += 1
+        exposures = command.leds(self._number)
+        frame = Frame(
+            elements,
+            sequence=self._number,
+            leds=sum(1 << channel for channel in exposures),
+            exposures=exposures,
+            sh_period=command.sh_period,
+            icg_period=command.icg_period,
+            master_clock=self._clock,
+            utc_ns=time.time_ns(),
+            monotonic_ns=time.monotonic_ns(),
+            flags=self._lost_flag(),
+        )
+        reasons = frame.invalid()
+        if before is not None and elements.tobytes() == before.tobytes():
+            reasons.append(
+                "the same as the frame before, to the last bit: it was read twice; does the "
+                "handshake line follow the device?"
+            )
+        if not reasons:
+            self.statistics.good += 1
+            return frame
+        self.statistics.invalid += 1
+        flags = frame.flags | FrameFlags.INVALID
+        return replace(frame, flags=flags, reasons=tuple(reasons))
+
+    def _lost_flag(self) -> FrameFlags:
+        lost, self._lost = self._lost, False
+        return FrameFlags.LOST if lost else FrameFlags.NONE
+
+    # --- stream mode
+
+    def _stream(self) -> Generator[Frame]:
+        total = self._command.count
+        try:
+            with suppress(LinkEnded):
+                self._issue(self._newest())
+                while total == 0 or self._number + 1 < total:
+                    frame = self._next_frame()
+                    if frame is not None:
+                        yield frame
+        finally:
+            if self._running:
+                self._stop()
+
+    def _issue(self, command: Command) -> None:
+        """Send a whole command to a device in whatever mode."""
+        self._pending, self._queued, self._age, self._tries = command, None, 0, 1
+        self._running, self._settled = True, False
+        pause(self._link, _BREATH)
+        self._link.transfer(replace(command, count=self._left()).encode(ORIGINAL_SIZE))
+
+    def _left(self) -> int:
+        """How many frames are still to come; 0 if there is no end."""
+        total = self._command.count
+        return max(1, total - self._number - 1) if total else 0
+
+    def _repeat(self) -> None:
+        """Send the newest command again, as if nothing was known of the device."""
+        self._attempts += 1
+        if self._attempts > self._retries and self._refusal is not None:
+            raise Refused(self._refusal, "sent several times, it was refused each time")
+        self._again()
+        self._fruitless = 0
+        self._doubtful = True
+        self._issue(self._newest())
+
+    def _next_frame(self) -> Frame | None:
+        """Do one transfer; None if it brought no frame to deliver."""
+        link, statistics = self._link, self.statistics
+        if not link.wait_ready(self._timeout):
+            statistics.timeouts += 1
+            self._repeat()
+            return None
+        if self._fruitless >= _FRUITLESS:
+            self._repeat()
+            return None
+        self._fruitless += 1
+        data = link.transfer(self._outgoing())
+        utc_ns, monotonic_ns = time.time_ns(), time.monotonic_ns()
+        try:
+            item = decode_frame(
+                data, master_clock=self._clock, utc_ns=utc_ns, monotonic_ns=monotonic_ns
+            )
+        except (BadVersion, BadHeader) as error:
+            raise LinkError(f"the device sends what this program does not know: {error}") from error
+        except DecodeError as error:
+            statistics.corrupt += 1
+            self._lost = self._doubtful = True
+            if self._on_corrupt is not None:
+                self._on_corrupt(error)
+            pause(link, _QUIET)
+            return None
+        if isinstance(item, Status):
+            self._answered(item)
+            return None
+        return self._accepted(item)
+
+    def _outgoing(self) -> bytes:
+        """Return what to send while reading: the command queued, or zeros."""
+        queued = self._queued
+        if queued is None or self._pending is not None or not self._settled:
+            return _ZEROS[STREAM_SIZE]
+        self._pending, self._queued, self._age = queued, None, 0
+        self._doubtful &= self._tries > 0
+        self._tries += 1
+        return replace(queued, count=self._left()).encode(STREAM_SIZE)
+
+    def _answered(self, status: Status) -> None:
+        """Take the device's answer to a command."""
+        self.status = status
+        if status.refusal is not Refusal.NONE:
+            self._refuse(status)
+            return
+        self._refusal = None
+        if self._pending is None:
+            return  # it has nothing else to send
+        self._confirm(0)  # sequence numbers and LED sequence begin together
+        self._started, self._settled = True, False
+        self._expected = 0 if self._number < 0 else None
+
+    def _confirm(self, base: int | None) -> None:
+        """Note that the device has taken the command, with the frame of that sequence number."""
+        if self._pending is not None:
+            # the number of frames to deliver is the capture's, whatever a change says
+            self._command = replace(self._pending, count=self._command.count)
+            self._tries = 0
+        self._pending, self._base, self._doubtful = None, base, False
+
+    def _resend(self, reason: str) -> None:
+        """Send the pending command with the next transfer once more."""
+        if self._tries > self._retries:
+            raise Refused(None, reason)
+        self._queued, self._pending = self._newest(), None
+        self.statistics.restarts += 1
+
+    def _refuse(self, status: Status) -> None:
+        """A refusal may be the link's fault: only the second one of a kind is believed."""
+        reason, before = status.refusal, self._refusal
+        self._refusal = reason
+        if reason is before and reason is not Refusal.CHECKSUM:
+            raise Refused(
+                reason,
+                f"it stays at -s {status.sh_period} -i {status.icg_period}; its firmware is "
+                f"{status.firmware!r}: do firmware and host program come from the same release?",
+            )
+        self._repeat()
+
+    def _accepted(self, frame: Frame) -> Frame | None:
+        """Number a good frame and tell its exposures; None if it is none of this capture's."""
+        changed = bool(frame.flags & FrameFlags.CHANGED)
+        if changed:
+            anew = not self._started or self._pending is not None
+            if anew and (not self._started or self._behind(frame)):
+                self._expected = None
+            self._started = True
+            if anew:
+                # if frames were dropped, the flag may be that of an earlier one
+                dropped = frame.flags & FrameFlags.DROPPED
+                self._confirm(None if dropped else frame.sequence)
+        elif self._pending is not None:
+            self._age += 1
+            if frame.flags & FrameFlags.REFUSED:
+                self._resend("its frames go on as before")
+            elif self._age > _UNCONFIRMED:
+                self._resend("its frames go on as if nothing had been sent")
+        if not self._started or self._behind(frame):
+            self.statistics.stale += 1
+            return None
+        self._settled = True
+        gap = 0 if self._expected is None else (frame.sequence - self._expected) % _SEQUENCES
+        self._expected = (frame.sequence + 1) % _SEQUENCES
+        self._number += 1 + gap
+        total = self._command.count
+        self._running = not (total and self._number + 1 >= total)
+        if total and self._number >= total:
+            return None
+        self._attempts = self._fruitless = 0
+        statistics = self.statistics
+        statistics.dropped += gap
+        statistics.good += 1
+        if gap:
+            self._doubtful = True
+            self._lost |= not frame.flags & FrameFlags.DROPPED
+        return frame.replaced(
+            sequence=self._number,
+            exposures=self._exposures(frame),
+            flags=frame.flags | self._lost_flag(),
+        )
+
+    def _behind(self, frame: Frame) -> bool:
+        """Whether a frame of this number has been delivered already."""
+        if self._expected is None:
+            return False
+        return (frame.sequence - self._expected) % _SEQUENCES >= _SEQUENCES // 2
+
+    def _exposures(self, frame: Frame) -> Mapping[int, int]:
+        """Find the frame in the LED sequence: at its place, or else the only one that fits.
+
+        The device sends the mask alone. Where a new sequence may be in force already without its
+        first frame having come, and both could have lit these LEDs, the exposure is unknown.
+        """
+        sequence = self._command.sequence
+        known = [*sequence]
+        if self._base is not None:
+            place = sequence[(frame.sequence - self._base) % _SEQUENCES % len(sequence)]
+            known = [place] if _mask(place) == frame.leds else known
+        change = self._pending or self._queued
+        if change is not None and (self._doubtful or len(known) > 1):
+            known += change.sequence
+        fitting = {tuple(lit.items()) for lit in known if _mask(lit) == frame.leds}
+        return dict(fitting.pop()) if len(fitting) == 1 else {}
+
+    def _stop(self) -> None:
+        """Leave the device with its LEDs off: one more unlit frame, and no other."""
+        self._running = False
+        last = replace(self._command, count=1, sequence=[{}])
+        with suppress(LinkError, OSError):
+            pause(self._link, _QUIET)
+            self._link.wait_ready(2 * self._command.icg_period / self._clock)
+            self._link.transfer(last.encode(STREAM_SIZE))
+
+
+def _mask(lit: Mapping[int, int]) -> int:
+    return sum(1 << channel for channel in lit)

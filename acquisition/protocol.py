@@ -1,0 +1,690 @@
+"""The bytes on the wire: commands to the microcontroller, frames from it, their checksum.
+
+Two framings share the command. In *original* mode every transfer has 7388 bytes, the elements of
+one read-out, low byte first, with neither header nor checksum. In *stream* mode every transfer has
+7424 bytes: a header of 32 bytes, the elements and a checksum, all little-endian.
+
+The checksum is that of the microcontroller's CRC unit: CRC-32/MPEG-2 (polynomial 0x04C11DB7,
+initial value 0xFFFFFFFF, nothing reflected, nothing inverted) over 32-bit words, where a word is
+read from memory in little-endian order. The single word 0x12345678 gives 0xDF8A8A2B.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from acquisition.frames import CHANNELS, ELEMENTS, MASTER_CLOCK, Frame, FrameFlags
+from acquisition.wiring import PROTOCOL, WIRING
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_STREAM: Final = PROTOCOL.stream
+
+ORIGINAL_SIZE: Final = PROTOCOL.original_size
+"""Bytes of every transfer in original mode."""
+STREAM_SIZE: Final = _STREAM.frame_size
+"""Bytes of every transfer in stream mode."""
+COMMAND_MAGIC: Final = bytes(PROTOCOL.command_magic)
+"""What a command begins with."""
+SH_MIN: Final = PROTOCOL.sh_min
+"""Shortest SH period, in master clocks."""
+ICG_MIN: Final = PROTOCOL.icg_min
+"""Shortest ICG period, in master clocks."""
+COUNT_MAX: Final = 0xFFFF
+"""Largest number of frames that a command can ask for."""
+TABLE_MAX: Final = _STREAM.table_max
+"""Largest number of entries of an LED sequence."""
+CHAIN_FIRST: Final = WIRING.leds.chain_first
+"""The first LED channel on the chain of shift registers."""
+CHAIN_STEP: Final = WIRING.leds.chain_step
+"""Master clocks between two steps of the chain: it has to shift the next pattern in."""
+LAST_TWO: Final = WIRING.leds.last_two
+"""The LED channels of the last two frames in original mode."""
+
+_U32_MAX: Final = 0xFFFF_FFFF
+_EXTENSION: Final = 16  # bytes before the table
+_CONTINUES: Final = _STREAM.exposure_continues
+_HEADER: Final = struct.Struct("<HBBIQQII")
+_ENTRY: Final = struct.Struct("<QI")
+_STATUS: Final = struct.Struct("<II32s")
+_CRC_AT: Final = STREAM_SIZE - 4
+_ELEMENTS: Final = slice(_HEADER.size, _HEADER.size + 2 * ELEMENTS)
+_STATUS_FLAG: Final = int(FrameFlags.STATUS)
+_KNOWN_FLAGS: Final = int(
+    FrameFlags.DROPPED | FrameFlags.CHANGED | FrameFlags.REFUSED | FrameFlags.STATUS
+)
+_REVERSED: Final = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
+
+
+class Mode(IntEnum):
+    """What a command asks for, its byte 10."""
+
+    ORIGINAL = PROTOCOL.modes["original"]
+    STREAM = PROTOCOL.modes["stream"]
+    SPIKES = PROTOCOL.modes["spikes"]
+    """Reserved."""
+
+
+class Refusal(IntEnum):
+    """Why the microcontroller did not take a command."""
+
+    NONE = _STREAM.refusals["none"]
+    VERSION = _STREAM.refusals["version"]
+    CHECKSUM = _STREAM.refusals["checksum"]
+    PERIODS = _STREAM.refusals["periods"]
+    TABLE = _STREAM.refusals["table"]
+    MODE = _STREAM.refusals["mode"]
+
+
+class CommandError(ValueError):
+    """A command that the microcontroller would refuse.
+
+    Parameters
+    ----------
+    message : str
+    refusal : Refusal
+        With what reason it would.
+    """
+
+    def __init__(self, message: str, refusal: Refusal) -> None:
+        super().__init__(message)
+        self.refusal = refusal
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (str(self), self.refusal)
+
+
+class DecodeError(ValueError):
+    """Bytes that are not what they should be."""
+
+
+class ShortFrame(DecodeError):  # noqa: N818
+    """More or fewer bytes than a transfer of this framing has."""
+
+
+class BadMagic(DecodeError):  # noqa: N818
+    """No frame (or command) begins where one should."""
+
+
+class BadChecksum(DecodeError):  # noqa: N818
+    """Bytes were changed on the way."""
+
+
+class BadVersion(DecodeError):  # noqa: N818
+    """An intact frame (or command) of a format unknown here."""
+
+
+class BadHeader(DecodeError):  # noqa: N818
+    """An intact frame whose header contradicts itself."""
+
+
+def crc32_words(data: bytes | bytearray | memoryview) -> int:
+    """Checksum of the microcontroller's CRC unit over little-endian 32-bit words.
+
+    Parameters
+    ----------
+    data : bytes-like
+        Its length is a multiple of 4.
+
+    Returns
+    -------
+    int
+        CRC-32/MPEG-2, fed the words from their most significant byte on.
+
+    Raises
+    ------
+    ValueError
+        The length is not a multiple of 4.
+    """
+    if len(data) % 4:
+        raise ValueError(
+            f"{len(data)} bytes: the unit takes words of 4 bytes; was the checksum itself included "
+            "or a byte lost?"
+        )
+    # zlib's CRC has the same polynomial, but takes each byte from its lowest bit on: reverse the
+    # bits of each word, and those of the result
+    words = np.frombuffer(data, "<u4").byteswap().tobytes()
+    return _reverse32(~zlib.crc32(words.translate(_REVERSED)))
+
+
+def _reverse32(word: int) -> int:
+    """Reverse the order of 32 bits."""
+    return int.from_bytes((word & _U32_MAX).to_bytes(4, "little").translate(_REVERSED), "big")
+
+
+@dataclass(frozen=True)
+class Command:
+    """What the sensor shall do, checked: a `Command` that exists is one the device accepts.
+
+    Parameters
+    ----------
+    sh_period : int
+        Time that the sensor gathers light, in master clocks (0.25 µs at 4 MHz), 40 or more.
+    icg_period : int
+        Time from read-out to read-out, in master clocks, a multiple of the SH period, 14776 or
+        more.
+    count : int
+        Frames, 1 to 65535; in stream mode 0 means endless.
+    mode : Mode, optional
+    sequence : sequence of mapping of int to int, optional
+        Stream mode: which LEDs are lit during each frame, over and over. One mapping for each
+        frame, from channel (0 to 5 on pins, 6 to 63 on the chain) to the LED's time in master
+        clocks, 1 up to the SH period, at the end of the integration; an empty mapping is an
+        unlit frame. Without any, one LED each in turn, for the whole integration: the two that
+        original mode lights.
+
+    Raises
+    ------
+    CommandError
+        A value is out of its range.
+    """
+
+    sh_period: int
+    icg_period: int
+    count: int
+    mode: Mode = Mode.ORIGINAL
+    sequence: Sequence[Mapping[int, int]] = field(default=())
+
+    def __post_init__(self) -> None:
+        check_periods(self.sh_period, self.icg_period)
+        if self.mode not in (Mode.ORIGINAL, Mode.STREAM):
+            raise CommandError(
+                f"mode = {self.mode!r}: allowed are Mode.ORIGINAL and Mode.STREAM", Refusal.MODE
+            )
+        object.__setattr__(self, "mode", Mode(self.mode))
+        lowest = 0 if self.mode is Mode.STREAM else 1
+        count = _whole("count (-n)", self.count, Refusal.PERIODS)
+        if not lowest <= count <= COUNT_MAX:
+            raise CommandError(
+                f"-n {count}: allowed are {lowest} to {COUNT_MAX} frames"
+                + ("" if lowest == 0 or count else "; only stream mode can go on without end"),
+                Refusal.PERIODS,
+            )
+        if self.mode is Mode.ORIGINAL and len(self.sequence):
+            raise CommandError(
+                "sequence: original mode lights its two LEDs itself; was stream mode meant?",
+                Refusal.MODE,
+            )
+        object.__setattr__(self, "sequence", self._checked_sequence())
+
+    def _checked_sequence(self) -> tuple[dict[int, int], ...]:
+        if self.mode is Mode.ORIGINAL:
+            return ()
+        given = self.sequence if len(self.sequence) else [{n: self.sh_period} for n in LAST_TWO]
+        result = tuple(_checked_exposures(n, lit, self.sh_period) for n, lit in enumerate(given))
+        entries = sum(len(_steps(lit)) for lit in result)
+        if entries > TABLE_MAX:
+            raise CommandError(
+                f"sequence: its {len(result)} frames need {entries} entries, one for each "
+                f"different exposure of a frame; the device's table holds {TABLE_MAX}",
+                Refusal.TABLE,
+            )
+        return result
+
+    @property
+    def size(self) -> int:
+        """Bytes of one transfer in this command's mode."""
+        return STREAM_SIZE if self.mode is Mode.STREAM else ORIGINAL_SIZE
+
+    def frame_rate(self, master_clock: int = MASTER_CLOCK) -> float:
+        """Read-outs per second at a master clock in Hz."""
+        return master_clock / self.icg_period
+
+    def leds(self, index: int) -> Mapping[int, int]:
+        """Tell which LEDs are lit during a frame.
+
+        Parameters
+        ----------
+        index : int
+            Of the frame, from 0.
+
+        Returns
+        -------
+        mapping of int to int
+            Exposure in master clocks by LED channel.
+        """
+        if self.mode is Mode.STREAM:
+            return self.sequence[index % len(self.sequence)]
+        remaining = self.count - 1 - index
+        return {LAST_TWO[1 - remaining]: self.sh_period} if 0 <= remaining <= 1 else {}
+
+    def encode(self, size: int | None = None) -> bytes:
+        """Encode for one transfer.
+
+        Parameters
+        ----------
+        size : int, optional
+            Length of the transfer, filled up with zeros: 7388 when the device is in original mode
+            or its mode is unknown (the default), 7424 when it is in stream mode.
+
+        Returns
+        -------
+        bytes
+        """
+        size = ORIGINAL_SIZE if size is None else size
+        if size not in (ORIGINAL_SIZE, STREAM_SIZE):
+            raise ValueError(
+                f"size = {size}: transfers have {ORIGINAL_SIZE} bytes in original mode and "
+                f"{STREAM_SIZE} in stream mode"
+            )
+        result = (
+            COMMAND_MAGIC
+            + struct.pack(">IIBH", self.sh_period, self.icg_period, self.mode, self.count)
+        )  # fmt: skip
+        if self.mode is not Mode.ORIGINAL:
+            table = self._table()
+            result += bytes([_STREAM.version, len(table), 0])
+            result += b"".join(_ENTRY.pack(*entry) for entry in table)
+            result += crc32_words(result).to_bytes(4, "little")
+        return result.ljust(size, b"\0")
+
+    def _table(self) -> list[tuple[int, int]]:
+        table = []
+        for lit in self.sequence:
+            steps = _steps(lit)
+            table += [(mask, exposure | _CONTINUES) for mask, exposure in steps[:-1]]
+            table.append(steps[-1])
+        return table
+
+    @classmethod
+    def decode(cls, data: bytes | bytearray | memoryview) -> Command:
+        """Decode what a host sent, as the device does.
+
+        Parameters
+        ----------
+        data : bytes-like
+            A transfer, or its beginning.
+
+        Returns
+        -------
+        Command
+
+        Raises
+        ------
+        BadMagic
+            It is no command: a plain read.
+        CommandError
+            It is a command that the device refuses; ``refusal`` says why.
+        """
+        data = bytes(data)
+        if data[:2] != COMMAND_MAGIC:
+            raise BadMagic(f"begins with {data[:2]!r}, not {COMMAND_MAGIC!r}: no command")
+        if len(data) < _EXTENSION:
+            raise ShortFrame(f"{len(data)} bytes: a command has {_EXTENSION} at least")
+        sh_period, icg_period, mode, count = struct.unpack_from(">IIBH", data, 2)
+        if mode == Mode.ORIGINAL:
+            return cls(sh_period, icg_period, count)
+        version, entries = data[13], data[14]
+        if version != _STREAM.version:
+            raise CommandError(
+                f"extension version {version}: known is {_STREAM.version}", Refusal.VERSION
+            )
+        if not 1 <= entries <= TABLE_MAX:
+            raise CommandError(f"{entries} entries: allowed are 1 to {TABLE_MAX}", Refusal.TABLE)
+        end = _EXTENSION + entries * _ENTRY.size
+        if len(data) < end + 4:
+            raise ShortFrame(f"{len(data)} bytes: {entries} entries need {end + 4}")
+        crc = int.from_bytes(data[end : end + 4], "little")
+        if crc != crc32_words(data[:end]):
+            raise CommandError("the checksum differs: bytes were changed", Refusal.CHECKSUM)
+        if mode != Mode.STREAM:
+            raise CommandError(f"mode {mode}: known are 0 and {Mode.STREAM.value}", Refusal.MODE)
+        sequence = _sequence(list(_ENTRY.iter_unpack(data[_EXTENSION:end])))
+        return cls(sh_period, icg_period, count, Mode.STREAM, sequence)
+
+
+def check_periods(sh_period: int, icg_period: int) -> None:
+    """Refuse periods that the device would refuse.
+
+    Parameters
+    ----------
+    sh_period, icg_period : int
+        In master clocks.
+
+    Raises
+    ------
+    CommandError
+        Names the value, what is allowed and the likely mistake.
+    """
+    sh = _whole("SH period (-s)", sh_period, Refusal.PERIODS)
+    icg = _whole("ICG period (-i)", icg_period, Refusal.PERIODS)
+    swapped = "; are -i and -s swapped?" if icg < sh else ""
+    if icg < ICG_MIN:
+        raise CommandError(
+            f"-i {icg} is below {ICG_MIN}, the clocks that a read-out takes{swapped}",
+            Refusal.PERIODS,
+        )
+    if icg > _U32_MAX:
+        raise CommandError(f"-i {icg} is above {_U32_MAX}, the largest value", Refusal.PERIODS)
+    if sh < SH_MIN:
+        raise CommandError(
+            f"-s {sh} is below {SH_MIN}, the sensor's shortest integration", Refusal.PERIODS
+        )
+    if icg % sh:
+        lower, upper = icg - icg % sh, icg - icg % sh + sh
+        near = f"{lower} or {upper}" if lower >= ICG_MIN else str(-(-ICG_MIN // sh) * sh)
+        raise CommandError(
+            f"-i {icg} is no multiple of -s {sh}: with this -s, -i may be {near}"
+            if icg > sh
+            else f"-i {icg} is below -s {sh}, of which it must be a multiple{swapped}",
+            Refusal.PERIODS,
+        )
+
+
+def _whole(name: str, value: Any, refusal: Refusal) -> int:
+    if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
+        raise CommandError(f"{name} = {value!r}: a whole number is needed", refusal)
+    return int(value)
+
+
+def _checked_exposures(frame: int, lit: Any, sh_period: int) -> dict[int, int]:
+    """Check one frame of a sequence; its LEDs in rising order, without those that stay dark."""
+    if not isinstance(lit, Mapping):
+        raise CommandError(
+            f"sequence[{frame}] = {lit!r}: a mapping from LED channel to exposure in master clocks "
+            "is needed",
+            Refusal.TABLE,
+        )
+    result = {}
+    for channel, exposure in lit.items():
+        name = f"sequence[{frame}]"
+        number = _whole(f"channel of {name}", channel, Refusal.TABLE)
+        clocks = _whole(f"{name}[{number}]", exposure, Refusal.TABLE)
+        if not 0 <= number < CHANNELS:
+            raise CommandError(
+                f"{name}: LED {number}: allowed are channels 0 to {CHANNELS - 1}; was a mask given?",
+                Refusal.TABLE,
+            )
+        if not 0 <= clocks <= min(sh_period, _CONTINUES - 1):
+            raise CommandError(
+                f"{name}[{number}] = {clocks} clocks: allowed is 0 up to the SH period, "
+                f"{sh_period}; light outside the integration is not seen",
+                Refusal.TABLE,
+            )
+        if clocks:
+            result[number] = clocks
+    steps = sorted({clocks for number, clocks in result.items() if number >= CHAIN_FIRST})
+    for first, second in pairwise(steps):
+        if second - first < CHAIN_STEP:
+            raise CommandError(
+                f"sequence[{frame}]: LEDs of the chain (channels {CHAIN_FIRST} and up) go on "
+                f"{second} and {first} clocks before the end; there must be {CHAIN_STEP} between",
+                Refusal.TABLE,
+            )
+    return dict(sorted(result.items()))
+
+
+def _steps(lit: Mapping[int, int]) -> list[tuple[int, int]]:
+    """Return (mask, exposure) by falling exposure; one unlit step for an unlit frame."""
+    masks: dict[int, int] = {}
+    for channel, exposure in lit.items():
+        masks[exposure] = masks.get(exposure, 0) | 1 << channel
+    return [(masks[e], e) for e in sorted(masks, reverse=True)] or [(0, 0)]
+
+
+def _sequence(table: list[tuple[int, int]]) -> list[dict[int, int]]:
+    """Undo `Command._table`, refusing what the device refuses."""
+    result: list[dict[int, int]] = []
+    lit: dict[int, int] = {}
+    before: int | None = None
+    for number, (mask, word) in enumerate(table):
+        exposure = word & ~_CONTINUES
+        if before is not None and exposure >= before:
+            raise CommandError(
+                f"entry {number}: exposure {exposure} after {before}; they must fall in a frame",
+                Refusal.TABLE,
+            )
+        for channel in range(CHANNELS):
+            if mask >> channel & 1:
+                lit.setdefault(channel, exposure)
+        if word & _CONTINUES:
+            before = exposure
+        else:
+            result.append(lit)
+            lit, before = {}, None
+    if before is not None:
+        raise CommandError("the last entry says that another one follows", Refusal.TABLE)
+    return result
+
+
+@dataclass(frozen=True)
+class Status:
+    """The device's answer to a command.
+
+    Parameters
+    ----------
+    refusal : Refusal
+        `Refusal.NONE`: accepted.
+    firmware : str
+        Build of the firmware.
+    sh_period, icg_period : int
+        Those in force, in master clocks.
+    timestamp : int
+        Device time, ns.
+    sequence : int
+    flags : FrameFlags
+    """
+
+    refusal: Refusal
+    firmware: str
+    sh_period: int
+    icg_period: int
+    timestamp: int = 0
+    sequence: int = 0
+    flags: FrameFlags = FrameFlags.STATUS
+
+
+def decode_elements(data: bytes | bytearray | memoryview) -> NDArray[np.uint16]:
+    """Decode a transfer of original mode: the elements alone.
+
+    Parameters
+    ----------
+    data : bytes-like
+        7388 bytes.
+
+    Returns
+    -------
+    ndarray of uint16, shape (3694,)
+
+    Raises
+    ------
+    ShortFrame
+        There are more or fewer bytes.
+    """
+    if len(data) != ORIGINAL_SIZE:
+        raise ShortFrame(f"{len(data)} bytes: a transfer in original mode has {ORIGINAL_SIZE}")
+    return np.frombuffer(data, "<u2").astype(np.uint16, copy=False)
+
+
+def encode_elements(frame: Frame) -> bytes:
+    """Encode a frame as the device sends it in original mode, 7388 bytes."""
+    return frame.elements.astype("<u2").tobytes()
+
+
+def decode_frame(
+    data: bytes | bytearray | memoryview,
+    *,
+    exposures: Mapping[int, int] | None = None,
+    master_clock: int = MASTER_CLOCK,
+    utc_ns: int = 0,
+    monotonic_ns: int = 0,
+) -> Frame | Status:
+    """Decode a transfer of stream mode.
+
+    Parameters
+    ----------
+    data : bytes-like
+        7424 bytes.
+    exposures : mapping of int to int, optional
+        Exposure in master clocks by LED channel: the device does not send it.
+    master_clock : int, optional
+        Of the sensor, Hz.
+    utc_ns, monotonic_ns : int, optional
+        The host's clocks at arrival, ns.
+
+    Returns
+    -------
+    Frame or Status
+
+    Raises
+    ------
+    DecodeError
+        `ShortFrame`, `BadMagic` or `BadChecksum`: it did not arrive as it was sent.
+        `BadVersion` or `BadHeader`: it did, but is not understood here.
+    """
+    header = _checked_header(data)
+    flags, sequence, leds, clocks, icg_period, sh_period = header
+    timestamp = _nanoseconds(clocks, master_clock)
+    if flags & _STATUS_FLAG:
+        code, _, build = _STATUS.unpack_from(data, _HEADER.size)
+        if code not in Refusal._value2member_map_:
+            raise BadHeader(f"refusal {code}: known are {[member.value for member in Refusal]}")
+        firmware = build.rstrip(b"\0").decode("ascii", "replace")
+        return Status(Refusal(code), firmware, sh_period, icg_period, timestamp, sequence, flags)
+    elements = np.frombuffer(data, "<u2", ELEMENTS, _HEADER.size).astype(np.uint16)
+    return Frame(
+        elements,
+        sequence=sequence,
+        leds=leds,
+        exposures={} if exposures is None else exposures,
+        sh_period=sh_period,
+        icg_period=icg_period,
+        master_clock=master_clock,
+        timestamp=timestamp,
+        utc_ns=utc_ns,
+        monotonic_ns=monotonic_ns,
+        flags=flags,
+    )
+
+
+def _checked_header(
+    data: bytes | bytearray | memoryview,
+) -> tuple[FrameFlags, int, int, int, int, int]:
+    if len(data) != STREAM_SIZE:
+        raise ShortFrame(f"{len(data)} bytes: a transfer in stream mode has {STREAM_SIZE}")
+    magic, version, flags, *rest = _HEADER.unpack_from(data)
+    if magic != _STREAM.magic:
+        raise BadMagic(
+            f"begins with {magic:#06x}, not {_STREAM.magic:#06x}: a transfer is out of step, or "
+            "the device is not in stream mode"
+        )
+    sent = int.from_bytes(data[_CRC_AT:], "little")
+    found = crc32_words(memoryview(data)[:_CRC_AT])
+    if sent != found:
+        raise BadChecksum(
+            f"checksum {found:#010x}, sent was {sent:#010x}: bytes were changed on the link"
+        )
+    if version != _STREAM.version:
+        raise BadVersion(
+            f"frame version {version}: known is {_STREAM.version}; firmware and host program "
+            "must come from the same release"
+        )
+    if flags & ~_KNOWN_FLAGS:
+        raise BadHeader(f"flags {flags:#04x}: known are {_KNOWN_FLAGS:#04x}")
+    return (FrameFlags(flags), *rest)
+
+
+def _nanoseconds(clocks: int, master_clock: int) -> int:
+    return clocks * 1_000_000_000 // master_clock
+
+
+def _clocks(nanoseconds: int, master_clock: int) -> int:
+    return -(-nanoseconds * master_clock // 1_000_000_000)
+
+
+def encode_frame(frame: Frame) -> bytes:
+    """Encode a frame as the device sends it in stream mode, 7424 bytes.
+
+    What belongs to the host (exposures, its clocks and flags) is not sent. A frame without a
+    timestamp gets 0.
+    """
+    clocks = _clocks(frame.timestamp or 0, frame.master_clock)
+    flags = int(frame.flags) & _KNOWN_FLAGS & ~FrameFlags.STATUS
+    head = (frame.sequence, frame.leds, clocks, frame.icg_period, frame.sh_period)
+    return _sealed(flags, head, encode_elements(frame))
+
+
+def encode_status(status: Status, master_clock: int = MASTER_CLOCK) -> bytes:
+    """Encode an answer as the device sends it in stream mode, 7424 bytes."""
+    clocks = _clocks(status.timestamp, master_clock)
+    flags = int(status.flags) & _KNOWN_FLAGS | FrameFlags.STATUS
+    head = (status.sequence, 0, clocks, status.icg_period, status.sh_period)
+    build = status.firmware.encode("ascii", "replace")
+    return _sealed(flags, head, _STATUS.pack(status.refusal, 0, build))
+
+
+def _sealed(flags: int, head: tuple[int, ...], body: bytes) -> bytes:
+    data = _HEADER.pack(_STREAM.magic, _STREAM.version, flags, *head) + body
+    data = data.ljust(_CRC_AT, b"\0")
+    return data + crc32_words(data).to_bytes(4, "little")
+
+
+_DTYPE: Final = np.dtype([
+    ("magic", "<u2"), ("version", "u1"), ("flags", "u1"), ("sequence", "<u4"), ("leds", "<u8"),
+    ("timestamp", "<u8"), ("icg_period", "<u4"), ("sh_period", "<u4"),
+    ("elements", "<u2", (ELEMENTS,)), ("crc", "<u4"),
+])  # fmt: skip
+
+
+def decode_frames(
+    data: bytes | NDArray[np.uint8], *, master_clock: int = MASTER_CLOCK
+) -> tuple[dict[str, NDArray[Any]], NDArray[np.bool_]]:
+    """Decode many transfers of stream mode at once.
+
+    Parameters
+    ----------
+    data : bytes or ndarray of uint8, shape (N, 7424)
+    master_clock : int, optional
+        Of the sensor, Hz.
+
+    Returns
+    -------
+    arrays : dict of str to ndarray
+        Of the frames that are good, in order: those entries of `acquisition.frames.stack` that
+        the device sends.
+    good : ndarray of bool, shape (N,)
+        Which transfers these are. Damaged ones and answers to commands are not among them.
+
+    Raises
+    ------
+    ShortFrame
+        The length is not a multiple of 7424 bytes.
+    """
+    block = np.frombuffer(data, np.uint8) if isinstance(data, bytes) else np.asarray(data)
+    if block.dtype != np.uint8 or block.size % STREAM_SIZE or block.shape[-1] % STREAM_SIZE:
+        raise ShortFrame(
+            f"{block.size} values of {block.dtype}, shape {block.shape}: rows of {STREAM_SIZE} "
+            "uint8 are needed"
+        )
+    block = np.ascontiguousarray(block).reshape(-1, STREAM_SIZE)
+    rows = block.view(_DTYPE)[:, 0]
+    good = (
+        (rows["magic"] == _STREAM.magic)
+        & (rows["version"] == _STREAM.version)
+        & (rows["flags"] & ~np.uint8(_KNOWN_FLAGS) == 0)
+        & (rows["flags"] & np.uint8(FrameFlags.STATUS) == 0)
+    )
+    for n in np.flatnonzero(good):
+        good[n] = crc32_words(block[n, :_CRC_AT].data) == rows["crc"][n]
+    kept = rows[good]
+    seconds, clocks = np.divmod(kept["timestamp"].astype(np.uint64), np.uint64(master_clock))
+    timestamp = seconds * np.uint64(10**9) + clocks * np.uint64(10**9) // np.uint64(master_clock)
+    return {
+        "elements": kept["elements"].astype(np.uint16, copy=False),
+        "sequence": kept["sequence"].astype(np.uint64),
+        "leds": kept["leds"].astype(np.uint64),
+        "sh_period": kept["sh_period"].astype(np.uint32),
+        "icg_period": kept["icg_period"].astype(np.uint32),
+        "master_clock": np.full(kept.size, master_clock, np.uint32),
+        "timestamp": timestamp.astype(np.int64),
+        "flags": kept["flags"].astype(np.uint32),
+    }, good
