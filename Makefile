@@ -1,4 +1,4 @@
-# make setup | run | test | lab | bench | notebooks | lint | lock | clean
+# make setup | run | test | lab | bench | notebooks | soak | flash | lint | lock | clean
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -7,15 +7,17 @@ BENCH := .venv-bench
 BENCH_STAMP := $(BENCH)/.complete
 INPUTS := environment.txt constraints.txt pyproject.toml
 
-.PHONY: help setup run test lint lab notebooks bench lock clean
+.PHONY: help setup build run test lint lab notebooks bench soak flash lock clean
 
 help:
-	@echo "make setup      build $(VENV) from environment.txt and install the project into it"
-	@echo "make run        all studies: table, figures, build/report.html"
+	@echo "make setup      build $(VENV) from environment.txt, install the project, compile firmware and twin"
+	@echo "make run        all studies: table, figures, build/report.html; a capture with the twin"
 	@echo "make test       linters, unit tests, every notebook"
 	@echo "make lab        open the notebooks in JupyterLab"
 	@echo "make notebooks  execute the notebooks again, in place, byte-reproducibly"
 	@echo "make bench      speed, beside other packages; table and build/bench.json"
+	@echo "make soak       faults on the twin's link, many more than make test tries"
+	@echo "make flash      copy the firmware to a Nucleo that is plugged in"
 
 # install FOLDER, ARGUMENTS: uv where it can be had (faster), pip otherwise
 define install
@@ -33,15 +35,22 @@ define install
 	fi
 endef
 
-setup: $(STAMP)
+setup: $(STAMP) build
+
+# firmware and event loop: make in their folders knows what is out of date
+build: $(STAMP)
+	@$(MAKE) --no-print-directory -C firmware ZIG="$(abspath $(BIN))/python -m ziglang"
+	@$(MAKE) --no-print-directory -C twin/core CC="$(abspath $(BIN))/python -m ziglang cc" \
+	  PYTHON=$(abspath $(BIN))/python
 
 $(STAMP): $(INPUTS)
 	$(call install,$(VENV),-r environment.txt -e .)
 	@touch $@
-	@echo "ready: make run, make test, make lab"
 
 run: setup
 	$(BIN)/python -m raytransfer --output build
+	$(BIN)/linetrack capture --link twin -i 30000 -s 100 -n 2 -o build/output
+	$(BIN)/linetrack plot build/output00001.dat build/output00002.dat --save build/output.png
 
 test: setup lint
 	$(BIN)/python -m pytest
@@ -61,8 +70,14 @@ $(BENCH_STAMP): $(INPUTS) benchmarks/peers.txt
 	$(call install,$(BENCH),-r environment.txt -r benchmarks/peers.txt -e .)
 	@touch $@
 
-bench: $(BENCH_STAMP)
+bench: $(BENCH_STAMP) build
 	$(BENCH)/bin/python -m benchmarks
+
+soak: setup
+	$(BIN)/python -m tests.twin.soak
+
+flash: setup
+	@$(MAKE) --no-print-directory -C firmware flash
 
 # --universal: one file for x86_64 and aarch64, Python 3.11 to 3.13
 lock: setup
@@ -70,4 +85,4 @@ lock: setup
 	  --no-header --no-annotate --no-emit-index-url --quiet - -o constraints.txt
 
 clean:
-	rm -rf $(VENV) $(BENCH) build .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(BENCH) build firmware/build* twin/core/build .mypy_cache .pytest_cache .ruff_cache

@@ -418,11 +418,11 @@ class Capture:
     def _next_frame(self) -> Frame | None:
         """Do one transfer; None if it brought no frame to deliver."""
         link, statistics = self._link, self.statistics
-        if not link.wait_ready(self._timeout):
-            statistics.timeouts += 1
-            self._repeat()
-            return None
-        if self._fruitless >= _FRUITLESS:
+        ready = link.wait_ready(self._timeout)
+        statistics.timeouts += not ready
+        # A stream that ran until now may have a frame though the line is stuck: look, once.
+        stuck = not ready and self._started and self._fruitless == 0
+        if not (ready or stuck) or self._fruitless >= _FRUITLESS:
             self._repeat()
             return None
         self._fruitless += 1
@@ -439,7 +439,10 @@ class Capture:
             self._lost = self._doubtful = True
             if self._on_corrupt is not None:
                 self._on_corrupt(error)
-            pause(link, _QUIET)
+            if stuck:
+                self._repeat()
+            else:
+                pause(link, _QUIET)
             return None
         if isinstance(item, Status):
             self._answered(item)

@@ -28,7 +28,8 @@ class Electronics:
     Parameters
     ----------
     full_well : float
-        Electrons at saturation. Makers of open boards quote 40,000 to 90,000.
+        Electrons that reach the output at saturation. Makers of open boards quote 40,000 to
+        90,000. As one SH pulse moves only `transfer_fraction` of it, a pixel holds more.
     transfer_fraction : float
         Part of a pixel's charge that one SH pulse moves; the rest is image lag. Measured on such
         boards: 0.44 to 0.54.

@@ -1,0 +1,152 @@
+#include "command.h"
+
+#define TABLE_AT 16u
+
+static uint32_t big_endian(const uint8_t *bytes)
+{
+    return ((uint32_t)bytes[0] << 24) | ((uint32_t)bytes[1] << 16) | ((uint32_t)bytes[2] << 8) |
+           bytes[3];
+}
+
+static uint32_t little_endian(const uint8_t *bytes)
+{
+    return ((uint32_t)bytes[3] << 24) | ((uint32_t)bytes[2] << 16) | ((uint32_t)bytes[1] << 8) |
+           bytes[0];
+}
+
+/* In software, four bits at a time: the CRC unit may be in the middle of a frame. The longest
+ * command takes about 70 us. */
+uint32_t crc_words(const uint8_t *bytes, uint32_t words)
+{
+    static const uint32_t table[16] = {
+        0x00000000, 0x04C11DB7, 0x09823B6E, 0x0D4326D9, 0x130476DC, 0x17C56B6B,
+        0x1A864DB2, 0x1E475005, 0x2608EDB8, 0x22C9F00F, 0x2F8AD6D6, 0x2B4BCB61,
+        0x350C9B64, 0x31CD86D3, 0x3C8EA00A, 0x384FBDBD,
+    };
+    uint32_t crc = 0xFFFFFFFFu;
+    for (uint32_t n = 0; n < words; n++) {
+        crc ^= little_endian(bytes + 4u * n);
+        for (uint32_t nibble = 0; nibble < 8u; nibble++)
+            crc = (crc << 4) ^ table[crc >> 28];
+    }
+    return crc;
+}
+
+bool command_present(const uint8_t *bytes)
+{
+    return bytes[0] == COMMAND_MAGIC_0 && bytes[1] == COMMAND_MAGIC_1;
+}
+
+bool periods_valid(uint32_t sh_period, uint32_t icg_period)
+{
+    return sh_period >= SH_MIN && icg_period >= ICG_MIN && icg_period % sh_period == 0;
+}
+
+struct entry {
+    uint64_t leds;
+    uint32_t exposure;
+    bool continues;
+};
+
+static struct entry entry_read(const uint8_t *bytes, uint32_t index)
+{
+    const uint8_t *at = bytes + TABLE_AT + index * STREAM_ENTRY_SIZE;
+    const uint32_t exposure = little_endian(at + 8);
+    return (struct entry){
+        .leds = ((uint64_t)little_endian(at + 4) << 32) | little_endian(at),
+        .exposure = exposure & ~STREAM_EXPOSURE_CONTINUES,
+        .continues = (exposure & STREAM_EXPOSURE_CONTINUES) != 0,
+    };
+}
+
+/* Exposures of one frame fall, and the last frame is complete. */
+static bool table_ordered(const uint8_t *bytes, uint32_t entries)
+{
+    uint32_t before = UINT32_MAX;
+    for (uint32_t n = 0; n < entries; n++) {
+        const struct entry entry = entry_read(bytes, n);
+        if (entry.exposure >= before)
+            return false;
+        before = entry.continues ? entry.exposure : UINT32_MAX;
+    }
+    return before == UINT32_MAX;
+}
+
+/* Lit LEDs go out with the ICG edge, so an exposure of n clocks begins n clocks before it. Light
+ * before the SH edge at the integration's beginning would belong to the frame before. */
+static uint32_t step_tick(const struct plan *plan, uint32_t exposure)
+{
+    const uint32_t longest = plan->sh_period - SH_EDGE;
+    return plan->icg_period - (exposure < longest ? exposure : longest);
+}
+
+static bool table_read(const uint8_t *bytes, uint32_t entries, struct plan *plan)
+{
+    uint32_t steps = 0;
+    uint64_t lit = 0;        /* in this frame so far */
+    uint32_t latched = 0;    /* exposure at the last latch of this frame; 0: none */
+    bool frame_begins = true;
+    for (uint32_t n = 0; n < entries; n++) {
+        const struct entry entry = entry_read(bytes, n);
+        if (frame_begins) {
+            plan->first_step[plan->frames++] = (uint8_t)steps;
+            lit = 0;
+            latched = 0;
+        }
+        frame_begins = !entry.continues;
+        const uint64_t leds = entry.exposure ? lit | entry.leds : lit;
+        if (entry.leds && entry.exposure > plan->sh_period)
+            return false;
+        if (leds == lit)
+            continue;
+        const bool latch = (leds >> LED_CHAIN_FIRST) != (lit >> LED_CHAIN_FIRST);
+        if (latch) {
+            if (latched && latched - entry.exposure < LED_CHAIN_STEP)
+                return false;
+            latched = entry.exposure;
+        }
+        lit = leds;
+        const uint32_t tick = step_tick(plan, entry.exposure);
+        plan->steps[steps++] = (struct step){.leds = leds, .tick = tick, .latch = latch};
+    }
+    plan->first_step[plan->frames] = (uint8_t)steps;
+
+    /* backwards, twice around, as the table is cyclic */
+    uint8_t next = NO_STEP;
+    for (uint32_t n = 2u * steps; n-- > 0;) {
+        struct step *step = &plan->steps[n < steps ? n : n - steps];
+        step->next_latch = next;
+        if (step->latch)
+            next = (uint8_t)(n < steps ? n : n - steps);
+    }
+    return true;
+}
+
+uint32_t command_read(const uint8_t *bytes, struct plan *plan)
+{
+    plan->sh_period = big_endian(bytes + 2);
+    plan->icg_period = big_endian(bytes + 6);
+    plan->mode = bytes[10];
+    plan->count = ((uint32_t)bytes[11] << 8) | bytes[12];
+    plan->frames = 0;
+    plan->first_step[0] = 0;
+
+    const bool periods = periods_valid(plan->sh_period, plan->icg_period);
+    if (plan->mode == MODE_ORIGINAL)
+        return periods ? REFUSAL_NONE : REFUSAL_PERIODS;
+    const uint32_t entries = bytes[14];
+    if (bytes[13] != STREAM_VERSION)
+        return REFUSAL_VERSION;
+    if (entries < 1u || entries > STREAM_TABLE_MAX)
+        return REFUSAL_TABLE;
+    const uint32_t end = TABLE_AT + entries * STREAM_ENTRY_SIZE;
+    if (crc_words(bytes, end / 4u) != little_endian(bytes + end))
+        return REFUSAL_CHECKSUM;
+    if (plan->mode != MODE_STREAM)
+        return REFUSAL_MODE;
+    if (!table_ordered(bytes, entries))
+        return REFUSAL_TABLE;
+    if (!periods)
+        return REFUSAL_PERIODS;
+    return table_read(bytes, entries, plan) ? REFUSAL_NONE : REFUSAL_TABLE;
+}

@@ -1,0 +1,66 @@
+#include "board.h"
+#include "command.h"
+#include "frames.h"
+#include "lights.h"
+#include "link.h"
+#include "sensor.h"
+
+static void original_command(struct plan *plan, uint32_t refusal)
+{
+    if (link_streams())
+        sensor_halt();
+    link_framing(false);
+    if (plan->count == 0)
+        return;
+    if (refusal)
+        sensor_periods(&plan->sh_period, &plan->icg_period); /* the last good ones */
+    sensor_acquire(plan);
+}
+
+static void stream_command(struct plan *plan, uint32_t refusal)
+{
+    if (refusal && sensor_streams()) {
+        sensor_mark_refusal();
+        return;
+    }
+    if (!refusal && sensor_exchange(plan))
+        return;
+    if (refusal)
+        sensor_halt(); /* original framing's frames do not fit in */
+    link_framing(true);
+    if (!refusal)
+        sensor_acquire(plan);
+    link_status(refusal);
+}
+
+void command_received(const uint8_t *bytes)
+{
+    struct plan *plan = sensor_spare_plan();
+    const uint32_t refusal = command_read(bytes, plan);
+    if (plan->mode == MODE_ORIGINAL)
+        original_command(plan, refusal);
+    else
+        stream_command(plan, refusal);
+}
+
+void frame_sealed(struct frame *frame)
+{
+    link_frame(frame);
+    sensor_queue_frame();
+}
+
+void SysTick_Handler(void)
+{
+    link_tick();
+}
+
+int main(void)
+{
+    board_init();
+    lights_init();
+    frames_init();
+    sensor_init();
+    link_init();
+    for (;;)
+        __asm__ volatile("wfi"); /* all work is done by interrupts */
+}

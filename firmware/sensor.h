@@ -1,0 +1,21 @@
+/* The sensor: its clocks (TIM3 fM, TIM2 SH, TIM5 ICG), the ADC (TIM4, ADC1, DMA2), and which
+ * read-outs are taken. */
+#ifndef SENSOR_H
+#define SENSOR_H
+
+#include "command.h"
+
+void sensor_init(void);
+struct plan *sensor_spare_plan(void); /* for the next command; in no other use */
+/* Flushes the sensor, then takes the plan's read-outs. Whatever went on before is given up. */
+void sensor_acquire(struct plan *plan);
+/* Takes over the plan's table and count without interrupting the stream that runs. Returns false
+ * if none runs, or one with other periods. */
+bool sensor_exchange(struct plan *plan);
+void sensor_halt(void);
+bool sensor_streams(void); /* or will, after the flush */
+void sensor_mark_refusal(void); /* in the next frame's header */
+void sensor_periods(uint32_t *sh_period, uint32_t *icg_period); /* the last good ones */
+void sensor_queue_frame(void); /* a frame may have become free */
+
+#endif

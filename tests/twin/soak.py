@@ -1,0 +1,46 @@
+"""Many more faults than the tests have time for: ``make soak`` (`python -m tests.twin.soak`)."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import Counter
+from concurrent.futures import ProcessPoolExecutor, as_completed
+
+from tests.twin.faults import DEVICE_FAULTS, LINK_FAULTS, Report, torture
+
+EACH = 1000
+
+
+def main() -> int:
+    """Run seeds in parallel; tell what struck, and fail at anything that should not be."""
+    parser = argparse.ArgumentParser(prog="python -m tests.twin.soak", description=__doc__)
+    parser.add_argument("--cases", type=int, default=100_000, metavar="N", help="default: 100000")
+    parser.add_argument("--seed", type=int, default=1000, metavar="N", help="the first one")
+    arguments = parser.parse_args()
+    runs = -(-arguments.cases // EACH)
+    struck: Counter[str] = Counter()
+    worst: Counter[str] = Counter()
+    corrupt = 0
+    with ProcessPoolExecutor() as pool:
+        # one run in eight with what makes the device forget its mode: that takes longer
+        futures = [
+            pool.submit(torture, arguments.seed + n, EACH, LINK_FAULTS if n % 8 else DEVICE_FAULTS)
+            for n in range(runs)
+        ]
+        for done, future in enumerate(as_completed(futures), start=1):
+            report: Report = future.result()
+            struck += report.faults
+            corrupt += report.corrupt
+            for kind, lost in report.lost.items():
+                worst[kind] = max(worst[kind], *lost)
+            sys.stdout.write(f"\r{done * EACH} of {runs * EACH} faults, {corrupt} corrupt frames")
+            sys.stdout.flush()
+    sys.stdout.write("\n")
+    for kind, count in sorted(struck.items()):
+        sys.stdout.write(f"{kind:18s} {count:7d} times, at most {worst[kind]} read-outs lost\n")
+    return int(corrupt > 0 or any(worst[kind] > 2 for kind in LINK_FAULTS))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,81 @@
+"""A bad cable between host and firmware: nothing false is delivered, and the stream comes back."""
+
+from __future__ import annotations
+
+import os
+from itertools import islice
+
+import numpy as np
+import pytest
+
+from acquisition.capture import Capture, capture
+from acquisition.frames import FrameFlags
+from acquisition.protocol import Command
+from tests.twin.faults import DEVICE_FAULTS, LINK_FAULTS, STREAM, FaultyLink, torture
+
+CASES = 2000 if "CI" in os.environ else 400
+SHARE = 0.15  # of the cases for faults after which the host must begin anew: they take longer
+
+
+def test_stream_survives_a_bad_link() -> None:
+    report = torture(seed=11, faults=round(CASES * (1 - SHARE)), kinds=LINK_FAULTS)
+    print(report)
+    assert report.corrupt == 0
+    assert set(report.lost) == set(LINK_FAULTS)
+    assert sum(report.faults.values()) >= CASES * (1 - SHARE)
+    for kind, lost in report.lost.items():
+        assert max(lost) <= 2, kind
+
+
+def test_stream_survives_resets_and_garbage_commands() -> None:
+    """The device may have left stream mode: the host finds out, and begins anew."""
+    report = torture(seed=12, faults=round(CASES * SHARE), kinds=DEVICE_FAULTS)
+    print(report)
+    assert report.corrupt == 0
+    assert set(report.faults) == set(DEVICE_FAULTS)
+    for kind, silent in report.silent.items():
+        assert max(silent) < 1.0, kind
+
+
+def test_every_fault_is_one() -> None:
+    """None of the faults is harmless by construction: each loses or delays something."""
+    for kind in (*LINK_FAULTS, *DEVICE_FAULTS):
+        hurt = 0
+        for seed in range(8):
+            with FaultyLink(seed) as link, Capture(link, STREAM, retries=8) as frames:
+                list(islice(frames, 3))
+                start = link.machine.seconds
+                link.strike(kind)
+                numbers = [frame.sequence for frame in islice(frames, 3)]
+                late = link.machine.seconds - start > 3.5 * STREAM.icg_period / 4e6
+                hurt += numbers != [3, 4, 5] or late or frames.statistics.corrupt > 0
+                assert link.struck[kind] == 1
+        expected = 0 if kind in ("bits flipped out", "garbage sent", "stuck high", "paused") else 1
+        assert hurt >= expected, kind
+
+
+@pytest.mark.parametrize("kind", ["bytes dropped", "bytes doubled", "truncated", "reset"])
+def test_original_mode_reports_invalid_data_where_it_can_be_seen(kind: str) -> None:
+    """Twelve bits, dummies and a dark reference are all the format has to check."""
+    seen = 0
+    for seed in range(12):
+        with FaultyLink(seed) as link:
+            frames = iter(capture(link, Command(100, 30000, 3), retries=8))
+            first = next(frames)
+            assert not first.flags & FrameFlags.INVALID
+            link.strike(kind)
+            rest = list(frames)
+            right = [frame.pixels.tobytes() in link.readouts for frame in rest]
+            flagged = [bool(frame.flags & FrameFlags.INVALID) for frame in rest]
+            seen += any(flagged)
+            # odd numbers of bytes shift low and high: 16 bits where the ADC has 12
+            for good, invalid, frame in zip(right, flagged, rest, strict=True):
+                if not good and not invalid:
+                    elements = frame.elements
+                    assert elements.max() <= 4095
+                    assert np.ptp(frame.dark) <= 128
+            # the next call is whole again
+            link.sleep(0.06)
+            again = list(capture(link, Command(100, 30000, 2), retries=8))
+            assert [frame.pixels.tobytes() in link.readouts for frame in again] == [True, True]
+    assert seen >= 6

@@ -1,0 +1,160 @@
+"""The prototype without hardware as a link: the firmware image, the sensor and a room, in one."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+from acquisition.links import LinkError
+from twin.machine import CLOCK, Machine
+from twin.sensor import Electronics, SensorModel
+from twin.world import CHANNELS, World
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+    from numpy.typing import NDArray
+
+SPI_CLOCK = 15_625_000
+"""What a Raspberry Pi makes of "16 MHz": 250 MHz / 16, Hz."""
+
+BOOT = 0.01
+"""Virtual seconds between power-on and the first call: real hosts come much later."""
+
+IMAGE = "F401_FW_TCD1304.elf"
+
+
+def firmware_image() -> Path:
+    """Path of the firmware's ELF: in an installed wheel, or built in a source tree.
+
+    Raises
+    ------
+    FileNotFoundError
+        If it has not been built.
+    """
+    package = Path(str(files("twin")))
+    for path in (package / IMAGE, package.parent / "firmware" / "build" / IMAGE):
+        if path.is_file():
+            return path
+    raise FileNotFoundError(
+        f"{IMAGE} is not built: run `make setup` in the project's folder, or "
+        "`make -C firmware CROSS=arm-none-eabi-` with gcc-arm-none-eabi installed"
+    )
+
+
+class TwinLink:
+    """A `Link` to the twin. Its time is virtual: nothing waits, nothing depends on the machine.
+
+    Parameters
+    ----------
+    world : World, optional
+        Two LEDs, a tracker at 1300 mm, a dark room when left out.
+    seed : int
+        Of the sensor's pattern and noise.
+    spi_clock : float
+        Hz.
+    host_latency : float
+        Virtual seconds from the handshake (or the end of a transfer) to the first clock.
+    image : Path, optional
+        Another firmware ELF.
+    electronics : Electronics, optional
+        Of the sensor and the ADC.
+    record : bool
+        Keep the edges of all pins, see `Machine`.
+    """
+
+    def __init__(
+        self,
+        world: World | None = None,
+        *,
+        seed: int = 1304,
+        spi_clock: float = SPI_CLOCK,
+        host_latency: float = 1e-4,
+        image: Path | None = None,
+        electronics: Electronics | None = None,
+        record: bool = False,
+    ) -> None:
+        if not 0 < spi_clock <= 42e6:
+            raise ValueError(f"spi_clock = {spi_clock:g} Hz: allowed is > 0 to 42e6; in MHz?")
+        if not 0 <= host_latency < 10:
+            raise ValueError(f"host_latency = {host_latency:g} s: allowed is 0 to 10; in ms?")
+        self.world = World() if world is None else world
+        self.sensor = SensorModel(seed, electronics, self.world.sensor)
+        self.spi_clock = spi_clock
+        self.host_latency = host_latency
+        self._rates = np.empty((1 + CHANNELS, self.world.sensor.pixels))
+        self._light(0)
+        figures = self.sensor.electronics
+        self.machine = Machine(
+            firmware_image() if image is None else image,
+            rates=self._rates,
+            full_well=figures.full_well / figures.transfer_fraction,
+            transfer_fraction=figures.transfer_fraction,
+            digitise=self._digitise,
+            light=self._light if self.world.moving else None,
+            idle_code=int(figures.code(np.array(figures.dark_voltage))),
+            record=record,
+        )
+        self.machine.run(BOOT)
+        self._open = True
+
+    def _light(self, cycles: int) -> bool:
+        """Electrons per second: first what is always there, then each LED channel."""
+        self._rates[0] = self.world.ambient_rate() * self.sensor.response
+        self._rates[0] += self.sensor.dark_rates()
+        self._rates[1:] = self.world.rates(cycles / CLOCK) * self.sensor.response
+        return True
+
+    def _digitise(self, charge: NDArray[np.float64], _: int) -> NDArray[np.uint16]:
+        # with an SH pulse every so often, as much dark signal is gathered as is carried over
+        integration = self.machine.readouts[-1]["integration"] / CLOCK
+        codes, idle = self.sensor.digitise(charge, integration)
+        return np.append(codes, np.uint16(idle))
+
+    def wait_ready(self, timeout: float) -> bool:
+        """Whether the handshake line is high now or within `timeout` virtual seconds."""
+        self._check_open()
+        ready = self.machine.wait_pin("PB2", level=True, timeout=timeout)
+        if ready and self.host_latency:
+            self.machine.run(self.host_latency)
+        return ready
+
+    def transfer(self, tx: bytes) -> bytes:
+        """Clock bytes out and as many in."""
+        self._check_open()
+        return self.machine.transfer(tx, self.spi_clock)
+
+    def sleep(self, seconds: float) -> None:
+        """Let virtual time pass."""
+        self._check_open()
+        self.machine.run(seconds)
+
+    def close(self) -> None:
+        """Free the emulator; the link cannot be used afterwards."""
+        self._open = False
+        self.machine.close()
+
+    def _check_open(self) -> None:
+        if not self._open:
+            raise LinkError("the link to the twin is closed")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def open_twin(argument: str | None = None, **options: Any) -> TwinLink:
+    """Open the twin for ``--link twin``; it takes no argument."""
+    if argument is not None:
+        raise ValueError(f"--link twin takes no argument, not {argument!r}")
+    return TwinLink(**options)
