@@ -155,7 +155,7 @@ def capture(
     command = _command(sh, icg, count, seconds, leds, stream=stream)
     session = Path(output).suffix.lower() in SESSION_SUFFIXES
     _check_target(Path(output), exists_is_wrong=session and not overwrite)
-    lens_system = {} if head is None else _description(head)
+    lens_system = None if head is None else _description(head)
     console = Console(stderr=True, quiet=quiet)
     error: BaseException | None = None
     with ExitStack() as stack:
@@ -166,7 +166,7 @@ def capture(
         metadata = {
             "link": " ".join([link, *([argument] if argument else [])]),
             "command": _as_json(command),
-            "lens_system": lens_system,
+            "lens_system": lens_system or getattr(device, "lens_system", {}),
             "master_clock": getattr(device, "master_clock", MASTER_CLOCK),
         }
         writer: _LateSession | DatWriter = DatWriter(output)
@@ -317,7 +317,7 @@ def _description(path: Path) -> dict[str, Any]:
         raise UsageError(f"--head {path}: neither TOML nor JSON ({error})") from error
     if not isinstance(value, dict):
         raise UsageError(f"--head {path}: names with values are needed, not a {type(value)}")
-    return {"file": path.name, "description": json.loads(json.dumps(value, default=str))}
+    return {"name": path.name, "description": json.loads(json.dumps(value, default=str))}
 
 
 def _as_json(command: Command) -> dict[str, Any]:
@@ -657,7 +657,7 @@ def _about_session(session: Session) -> dict[str, str]:
         + f", linetrack {escape(metadata.linetrack_version)}",
         "link": escape(metadata.link) or "unknown",
         "firmware": escape(metadata.firmware_build) or "unknown",
-        "lens head": escape(str(metadata.lens_system.get("file", "")) or "not described"),
+        "lens head": escape(str(metadata.lens_system.get("name", "")) or "not described"),
         "frames": str(count),
     }
     if not count:

@@ -73,8 +73,9 @@ class LinkEnded(LinkError):  # noqa: N818
 class Link(Protocol):
     """The wires between host and microcontroller.
 
-    A link may also have ``sleep(seconds)``, where time is not the host's, and ``master_clock``
-    (Hz), where the sensor's differs from the prototype's; see `pause`.
+    A link may also have ``sleep(seconds)``, where time is not the host's, ``master_clock`` (Hz),
+    where the sensor's differs from the prototype's, and ``lens_system``, a mapping that JSON can
+    hold with at least a ``name``, where it knows the head in front of the sensor; see `pause`.
     """
 
     def wait_ready(self, timeout: float) -> bool:

@@ -45,6 +45,8 @@ TABLE_MAX: Final = _STREAM.table_max
 """Largest number of entries of an LED sequence."""
 CHAIN_FIRST: Final = WIRING.leds.chain_first
 """The first LED channel on the chain of shift registers."""
+EXPOSURE_MIN: Final = PROTOCOL.stream.exposure_min
+"""Shortest exposure of an LED, master clocks."""
 CHAIN_STEP: Final = WIRING.leds.chain_step
 """Master clocks between two steps of the chain: it has to shift the next pattern in."""
 LAST_TWO: Final = WIRING.leds.last_two
@@ -178,7 +180,7 @@ class Command:
     sequence : sequence of mapping of int to int, optional
         Stream mode: which LEDs are lit during each frame, over and over. One mapping for each
         frame, from channel (0 to 5 on pins, 6 to 63 on the chain) to the LED's time in master
-        clocks, 1 up to the SH period, at the end of the integration; an empty mapping is an
+        clocks, 10 up to the SH period, at the end of the integration; an empty mapping is an
         unlit frame. Without any, one LED each in turn, for the whole integration: the two that
         original mode lights.
 
@@ -404,10 +406,10 @@ def _checked_exposures(frame: int, lit: Any, sh_period: int) -> dict[int, int]:
                 f"{name}: LED {number}: allowed are channels 0 to {CHANNELS - 1}; was a mask given?",
                 Refusal.TABLE,
             )
-        if not 0 <= clocks <= min(sh_period, _CONTINUES - 1):
+        if clocks and not EXPOSURE_MIN <= clocks <= min(sh_period, _CONTINUES - 1):
             raise CommandError(
-                f"{name}[{number}] = {clocks} clocks: allowed is 0 up to the SH period, "
-                f"{sh_period}; light outside the integration is not seen",
+                f"{name}[{number}] = {clocks} clocks: allowed are 0 (dark) and {EXPOSURE_MIN} up "
+                f"to the SH period, {sh_period}; light outside the integration is not seen",
                 Refusal.TABLE,
             )
         if clocks:

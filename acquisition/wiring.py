@@ -188,6 +188,7 @@ class Stream:
     frame_size: int
     table_max: int
     entry_size: int
+    exposure_min: int
     exposure_continues: int
     stall_us: int
     original_stall_us: int
@@ -479,6 +480,7 @@ _ASSERTS: Final = (
     '_Static_assert(STREAM_FRAME_SIZE % 4 == 0, "the CRC unit takes words");',
     "_Static_assert(16 + STREAM_TABLE_MAX * STREAM_ENTRY_SIZE + 4 <= ORIGINAL_SIZE,",
     '               "a command fits in a transfer");',
+    '_Static_assert(SH_EDGE < STREAM_EXPOSURE_MIN, "an LED goes on before ICG\'s edge");',
     '_Static_assert(SH_EDGE < ICG_PULSE && ICG_PULSE < SH_MIN, "pulses do not overlap");',
     '_Static_assert(LED_GPIO_COUNT <= LED_CHAIN_FIRST, "pins, then the chain");',
     '_Static_assert(LED_CHAIN_BITS == 64, "one pattern is a uint64_t");',

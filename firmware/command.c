@@ -72,14 +72,6 @@ static bool table_ordered(const uint8_t *bytes, uint32_t entries)
     return before == UINT32_MAX;
 }
 
-/* Lit LEDs go out with the ICG edge, so an exposure of n clocks begins n clocks before it. Light
- * before the SH edge at the integration's beginning would belong to the frame before. */
-static uint32_t step_tick(const struct plan *plan, uint32_t exposure)
-{
-    const uint32_t longest = plan->sh_period - SH_EDGE;
-    return plan->icg_period - (exposure < longest ? exposure : longest);
-}
-
 static bool table_read(const uint8_t *bytes, uint32_t entries, struct plan *plan)
 {
     uint32_t steps = 0;
@@ -95,7 +87,8 @@ static bool table_read(const uint8_t *bytes, uint32_t entries, struct plan *plan
         }
         frame_begins = !entry.continues;
         const uint64_t leds = entry.exposure ? lit | entry.leds : lit;
-        if (entry.leds && entry.exposure > plan->sh_period)
+        if (entry.leds && entry.exposure &&
+            (entry.exposure < STREAM_EXPOSURE_MIN || entry.exposure > plan->sh_period))
             return false;
         if (leds == lit)
             continue;
@@ -106,7 +99,8 @@ static bool table_read(const uint8_t *bytes, uint32_t entries, struct plan *plan
             latched = entry.exposure;
         }
         lit = leds;
-        const uint32_t tick = step_tick(plan, entry.exposure);
+        /* LEDs go out with the SH edge that ends the integration, SH_EDGE after ICG's */
+        const uint32_t tick = plan->icg_period + SH_EDGE - entry.exposure;
         plan->steps[steps++] = (struct step){.leds = leds, .tick = tick, .latch = latch};
     }
     plan->first_step[plan->frames] = (uint8_t)steps;

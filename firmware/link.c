@@ -245,6 +245,8 @@ static void complete(void)
         armed = &status_frame;
         offered = false;
     } else {
+        /* not only at the next ICG edge: a host that looks at the level would read a frame twice */
+        pin_low(READY_PORT, READY_PIN);
         watch_clock(); /* the next transfer may come at once */
     }
     irq_restore(masked);
@@ -259,6 +261,7 @@ static void complete(void)
         frame_release(armed);
         arm(queued, true);
         queued = NULL;
+        pin_high(READY_PORT, READY_PIN);
     }
     irq_restore(masked);
 }

@@ -2,8 +2,9 @@
  * update of TIM3, which makes fM: so ICG's edges keep their phase to fM, and SH follows ICG by one
  * clock. In clocks after TIM5's update, seen by the sensor, whose signals are inverted:
  *
- *    0  ICG falls; TIM5's interrupt puts out the LEDs and arms TIM4
- *    1  SH rises          9  SH falls: the integration ends
+ *    0  ICG falls; TIM5's interrupt arms TIM4
+ *    1  SH rises
+ *    9  SH falls: the integration ends, and stream mode's LEDs go out
  *   19  TIM2's trigger starts TIM4
  *   20  ICG rises: element 0 is on OS, each for 4 clocks
  *
@@ -302,7 +303,6 @@ static void expose(void)
 
 static void read_out(void)
 {
-    adc_arm();
     exposed.timestamp = edge_time + SH_EDGE;
     readouts[begun++ % 2u] = exposed;
     if (plan->count && --remaining == 0 && !next_plan)
@@ -322,6 +322,12 @@ static void begin(void)
 
 static void icg_edge(void)
 {
+    if (phase == READ) {
+        adc_arm(); /* the one thing that cannot wait */
+        if (plan->mode == MODE_STREAM && exposed.leds)
+            while (TIM5->CNT < SH_EDGE - 2u) { /* what it takes comes on top; later, it would light the next frame */
+            }
+    }
     lights_off();
     lights_none();
     TIM2->DIER = 0;

@@ -98,6 +98,7 @@
 #define STREAM_FRAME_SIZE 7424u
 #define STREAM_TABLE_MAX 64u
 #define STREAM_ENTRY_SIZE 12u
+#define STREAM_EXPOSURE_MIN 10u
 #define STREAM_EXPOSURE_CONTINUES 0x80000000u
 #define STREAM_STALL_US 1000u
 #define STREAM_ORIGINAL_STALL_US 50000u
@@ -122,6 +123,7 @@ _Static_assert(STREAM_FRAME_SIZE == STREAM_HEADER_SIZE + ORIGINAL_SIZE + 4,
 _Static_assert(STREAM_FRAME_SIZE % 4 == 0, "the CRC unit takes words");
 _Static_assert(16 + STREAM_TABLE_MAX * STREAM_ENTRY_SIZE + 4 <= ORIGINAL_SIZE,
                "a command fits in a transfer");
+_Static_assert(SH_EDGE < STREAM_EXPOSURE_MIN, "an LED goes on before ICG's edge");
 _Static_assert(SH_EDGE < ICG_PULSE && ICG_PULSE < SH_MIN, "pulses do not overlap");
 _Static_assert(LED_GPIO_COUNT <= LED_CHAIN_FIRST, "pins, then the chain");
 _Static_assert(LED_CHAIN_BITS == 64, "one pattern is a uint64_t");

@@ -114,6 +114,17 @@ class TwinLink:
         codes, idle = self.sensor.digitise(charge, integration)
         return np.append(codes, np.uint16(idle))
 
+    @property
+    def lens_system(self) -> dict[str, object]:
+        """The head in front of the sensor, for a session's metadata; mm."""
+        head = self.world.head
+        return {
+            "name": head.name,
+            "elements": [element.part for element in head.elements],
+            "gaps": list(head.gaps),
+            "sensor_distance": head.sensor_distance,
+        }
+
     def wait_ready(self, timeout: float) -> bool:
         """Whether the handshake line is high now or within `timeout` virtual seconds."""
         self._check_open()

@@ -102,7 +102,7 @@ def test_endless_stream_is_stopped_dark_and_another_follows() -> None:
 
 def test_running_stream_of_somebody_else_is_taken_over() -> None:
     link = FakeMcu()
-    foreign = Command(100, 20000, 0, Mode.STREAM, [{5: 7}])
+    foreign = Command(100, 20000, 0, Mode.STREAM, [{5: 70}])
     first = Capture(link, foreign)
     for _ in range(5):
         next(first)
@@ -155,7 +155,7 @@ def test_sequence_changed_on_the_way() -> None:
 def test_change_keeps_the_number_of_frames() -> None:
     frames = Capture(FakeMcu(), stream(20))
     found = [next(frames) for _ in range(5)]
-    frames.send([{2: 9}])
+    frames.send([{2: 90}])
     found += frames
     assert [frame.sequence for frame in found] == list(range(20))
 
@@ -164,7 +164,7 @@ def test_lost_change_is_sent_again() -> None:
     link = FakeMcu()
     frames = Capture(link, stream())
     next(frames)
-    frames.send([{2: 9}])
+    frames.send([{2: 90}])
     plain, link.exchange = link.exchange, lambda tx: plain(bytes(len(tx)))  # type: ignore[method-assign]
     for _ in range(3):
         next(frames)
@@ -179,7 +179,7 @@ def test_change_that_never_arrives_is_an_error() -> None:
     link = FakeMcu()
     frames = Capture(link, stream())
     next(frames)
-    frames.send([{2: 9}])
+    frames.send([{2: 90}])
     plain = link.exchange
     link.exchange = lambda tx: plain(bytes(len(tx)))  # type: ignore[method-assign]
     with pytest.raises(Refused, match="as if nothing had been sent"):
@@ -188,17 +188,17 @@ def test_change_that_never_arrives_is_an_error() -> None:
 
 def test_change_before_the_first_frame() -> None:
     frames = Capture(FakeMcu(), stream(6))
-    frames.send([{5: 5}])
-    assert [dict(frame.exposures) for frame in frames] == [{5: 5}] * 6
+    frames.send([{5: 40}])
+    assert [dict(frame.exposures) for frame in frames] == [{5: 40}] * 6
     frames = Capture(FakeMcu(), stream())
     next(frames)
-    frames.send(Command(50, 30000, 0, Mode.STREAM, [{5: 5}]))
+    frames.send(Command(50, 30000, 0, Mode.STREAM, [{5: 40}]))
     while frames.command.sh_period != 50:
         next(frames)
-    frames.send([{5: 6}])
+    frames.send([{5: 45}])
     found = [next(frames) for _ in range(8)]
     assert [f.exposures[5] for f in found] == sorted(f.exposures[5] for f in found)
-    assert found[-1].exposures == {5: 6}
+    assert found[-1].exposures == {5: 45}
     frames.close()
 
 
@@ -223,11 +223,11 @@ def test_late_host_at_a_change_does_not_mix_exposures_up() -> None:
 def test_no_exposure_is_made_up(seed: int) -> None:
     """One LED, only its exposure changes: each frame's is the true one, or unknown."""
     link = FaultyWire(seed, 0.15, ["flip", "truncate", "deaf", "flip tx"])
-    frames = Capture(link, Command(100, 20000, 0, Mode.STREAM, [{0: 1}]), retries=20)
+    frames = Capture(link, Command(100, 20000, 0, Mode.STREAM, [{0: 10}]), retries=20)
     known = 0
     for n in range(120):
         if n % 6 == 5:
-            frames.send([{0: n}] if n < 100 else [{0: 100}])
+            frames.send([{0: n + 10}] if n < 90 else [{0: 100}])
         frame = next(frames)
         assert frame.timestamp is not None
         if frame.exposures:
@@ -238,7 +238,7 @@ def test_no_exposure_is_made_up(seed: int) -> None:
 
 def test_change_is_for_streams_alone() -> None:
     with pytest.raises(ValueError, match="use stream mode"):
-        Capture(FakeMcu(), original()).send([{0: 1}])
+        Capture(FakeMcu(), original()).send([{0: 10}])
     with pytest.raises(ValueError, match="new capture"):
         Capture(FakeMcu(), stream()).send(original())
 

@@ -172,7 +172,7 @@ def test_stream_into_a_session(run: Callable[..., Result], tmp_path: Path) -> No
     assert about.command["sequence"] == [{"0": 100}, {"1": 100}]
     assert about.command["icg_period"] == 14800  # the shortest with -s 100
     assert about.lens_system == {
-        "file": "head.toml",
+        "name": "head.toml",
         "description": {"name": "f60 pair", "gaps": [1.5]},
     }
 
@@ -229,7 +229,11 @@ def test_an_empty_recording_is_a_failure(run: Callable[..., Result]) -> None:
         ("capture --stream --leds 0:x", 2, "'0:x' is not CHANNEL or CHANNEL:CLOCKS"),
         ("capture --stream --leds 0+0", 2, "LED 0 twice in one frame"),
         ("capture --stream --leds 64", 2, "LED 64: allowed are channels 0 to 63"),
-        ("capture --stream --leds 0:800", 2, "800 clocks: allowed is 0 up to the SH period, 100"),
+        (
+            "capture --stream --leds 0:800",
+            2,
+            "= 800 clocks: allowed are 0 .dark. and 10 up to the SH period, 100",
+        ),
         ("capture -o none/x", 2, "there is no folder none"),
         ("capture -o run.h5", 2, "-o run.h5: exists; take another name, or --overwrite"),
         ("capture --head run.h5", 2, "--head run.h5: neither TOML nor JSON"),

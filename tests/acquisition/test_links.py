@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 ORIGINAL = Command(100, 30000, 3)
-STREAM = Command(100, 20000, 6, Mode.STREAM, [{0: 5}, {1: 6}, {}])
+STREAM = Command(100, 20000, 6, Mode.STREAM, [{0: 50}, {1: 60}, {}])
 
 
 # --- by name

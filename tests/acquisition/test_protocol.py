@@ -15,6 +15,7 @@ from acquisition.frames import CHANNELS, ELEMENTS, Frame, FrameFlags, stack
 from acquisition.protocol import (
     CHAIN_FIRST,
     CHAIN_STEP,
+    EXPOSURE_MIN,
     ICG_MIN,
     ORIGINAL_SIZE,
     SH_MIN,
@@ -95,7 +96,10 @@ def periods(draw: st.DrawFn) -> tuple[int, int]:
 @st.composite
 def exposures(draw: st.DrawFn, sh: int) -> dict[int, int]:
     pins = draw(
-        st.dictionaries(st.integers(0, CHAIN_FIRST - 1), st.integers(0, min(sh, 2**31 - 1)))
+        st.dictionaries(
+            st.integers(0, CHAIN_FIRST - 1),
+            st.just(0) | st.integers(EXPOSURE_MIN, min(sh, 2**31 - 1)),
+        )
     )
     steps = range(CHAIN_STEP, min(sh, 400) + 1, CHAIN_STEP)
     chain = st.dictionaries(st.integers(CHAIN_FIRST, CHANNELS - 1), st.sampled_from(steps))
@@ -163,15 +167,16 @@ def test_leds_of_a_frame() -> None:
         ((100, True, 2), "whole number"),
         ((100, 30000, 2, Mode.SPIKES), "mode"),
         ((100, 30000, 2, 9), "mode"),
-        ((100, 30000, 2, Mode.ORIGINAL, [{0: 1}]), "stream mode meant"),
-        ((100, 30000, 2, Mode.STREAM, [{64: 1}]), "channels 0 to 63"),
-        ((100, 30000, 2, Mode.STREAM, [{0: 101}]), "0 up to the SH period, 100"),
+        ((100, 30000, 2, Mode.ORIGINAL, [{0: 10}]), "stream mode meant"),
+        ((100, 30000, 2, Mode.STREAM, [{64: 10}]), "channels 0 to 63"),
+        ((100, 30000, 2, Mode.STREAM, [{0: 101}]), "10 up to the SH period, 100"),
+        ((100, 30000, 2, Mode.STREAM, [{0: 9}]), "allowed are 0 .dark. and 10"),
         ((100, 30000, 2, Mode.STREAM, [{0: -1}]), "0 up to the SH period"),
         ((100, 30000, 2, Mode.STREAM, [3]), "a mapping from LED channel"),
         ((100, 30000, 2, Mode.STREAM, [{0: 1.5}]), "whole number"),
         ((100, 30000, 2, Mode.STREAM, [{6: 10, 7: 49}]), "49 and 10 clocks.*40 between"),
-        ((100, 30000, 2, Mode.STREAM, [{0: 1}] * (TABLE_MAX + 1)), "65 entries.*holds 64"),
-        ((100, 30000, 2, Mode.STREAM, [{0: 1, 1: 2}] * 33), "66 entries"),
+        ((100, 30000, 2, Mode.STREAM, [{0: 10}] * (TABLE_MAX + 1)), "65 entries.*holds 64"),
+        ((100, 30000, 2, Mode.STREAM, [{0: 10, 1: 11}] * 33), "66 entries"),
     ],
 )
 def test_bad_commands(arguments: tuple[object, ...], words: str) -> None:

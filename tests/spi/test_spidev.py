@@ -116,7 +116,7 @@ print(json.dumps([
 
 @pytest.mark.parametrize(
     "command",
-    ["Command(100, 30000, 2)", "Command(100, 30000, 4, Mode.STREAM, [{0: 9}, {1: 8}])"],
+    ["Command(100, 30000, 2)", "Command(100, 30000, 4, Mode.STREAM, [{0: 90}, {1: 80}])"],
 )
 def test_the_same_frames_as_without_spidev(shim: Path, tmp_path: Path, command: str) -> None:
     asked = eval(command, {"Command": Command, "Mode": Mode})  # noqa: S307

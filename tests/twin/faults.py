@@ -181,6 +181,13 @@ class Report:
     silent: dict[str, list[float]] = field(default_factory=dict)
     corrupt: int = 0
 
+    def __str__(self) -> str:
+        lines = [f"{self.corrupt} corrupt frames delivered as good"]
+        for kind, count in sorted(self.faults.items()):
+            lost, silent = max(self.lost.get(kind, [0])), max(self.silent.get(kind, [0.0]))
+            lines.append(f"{kind:18s} {count:5d} times, at most {lost} lost, {silent:.3f} s silent")
+        return "\n".join(lines)
+
 
 def torture(seed: int, faults: int, kinds: tuple[str, ...], *, between: int = 2) -> Report:
     """Let faults strike a running stream, and judge every frame that is delivered.
