@@ -29,7 +29,17 @@ def test_wheel_captures_with_the_twin(tmp_path: Path) -> None:
             target = source / name
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_bytes((ROOT / name).read_bytes())
-    build = [sys.executable, "-m", "uv", "build", "--wheel", "--quiet", "-o", tmp_path, source]
+    build = [
+        sys.executable,
+        "-m",
+        "uv",
+        "build",
+        "--wheel",
+        "--quiet",
+        "-o",
+        str(tmp_path),
+        str(source),
+    ]
     subprocess.run(build, check=True)
     (wheel,) = tmp_path.glob("*.whl")
     names = zipfile.ZipFile(wheel).namelist()
