@@ -335,13 +335,17 @@ void link_tick(void)
         }
         arm(armed, true);
     } else {
-        if (armed == &status_frame)
-            status_due = status_due || offered;
-        else if (queued)
-            drop(armed);
-        else
-            queued = armed;
-        arm_next();
+        if (armed != &status_frame && !status_due) {
+            arm(armed, true); /* once more, so that a broken transfer costs its own frame only */
+        } else {
+            if (armed == &status_frame)
+                status_due = status_due || offered;
+            else if (queued)
+                drop(armed);
+            else
+                queued = armed;
+            arm_next();
+        }
     }
     irq_restore(masked);
 }

@@ -170,6 +170,8 @@ class Report:
         How often each kind struck.
     lost : dict of str to list of int
         Read-outs of the time after a fault was over that did not arrive, for each of a kind.
+    missing : dict of str to list of int
+        Read-outs that did not arrive from the fault's beginning on, the one it struck included.
     silent : dict of str to list of float
         Virtual seconds from the fault to the next good frame.
     corrupt : int
@@ -178,6 +180,7 @@ class Report:
 
     faults: Counter[str] = field(default_factory=Counter)
     lost: dict[str, list[int]] = field(default_factory=dict)
+    missing: dict[str, list[int]] = field(default_factory=dict)
     silent: dict[str, list[float]] = field(default_factory=dict)
     corrupt: int = 0
 
@@ -200,7 +203,8 @@ def torture(seed: int, faults: int, kinds: tuple[str, ...], *, between: int = 2)
     report = Report()
     with FaultyLink(seed) as link:
         frames = Capture(link, STREAM, retries=8)
-        booted = _device_clock(link, next(frames))
+        first = next(frames)
+        booted, before = _device_clock(link, first), first.sequence
         for _ in range(faults):
             kind = kinds[int(link.rng.integers(len(kinds)))]
             struck, start = link.struck[kind], link.machine.seconds
@@ -213,8 +217,11 @@ def torture(seed: int, faults: int, kinds: tuple[str, ...], *, between: int = 2)
             for frame in delivered:
                 report.corrupt += not _is_what_was_digitised(link, frame)
             if link.struck[kind] > struck:
+                missing = delivered[-1].sequence - before - len(delivered)
+                report.missing.setdefault(kind, []).append(missing)
                 report.lost.setdefault(kind, []).append(_lost(link, delivered, booted))
                 report.silent.setdefault(kind, []).append(silent)
+            before = delivered[-1].sequence
             link.fault = None
         report.faults = link.struck
     return report

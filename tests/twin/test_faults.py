@@ -25,6 +25,11 @@ def test_stream_survives_a_bad_link() -> None:
     assert sum(report.faults.values()) >= CASES * (1 - SHARE)
     for kind, lost in report.lost.items():
         assert max(lost) <= 2, kind
+    # a short or broken transfer costs at most its own frame
+    for kind in ("bits flipped in", "bits flipped out", "bytes dropped", "truncated", "overlong"):
+        assert max(report.missing[kind]) <= 1, kind
+    # pulses too many may begin the next frame: the time to notice can make the link miss that one
+    assert max(report.missing["bytes doubled"]) <= 2
 
 
 def test_stream_survives_resets_and_garbage_commands() -> None:

@@ -1,0 +1,97 @@
+"""Only what the firmware really does counts: firmware with wrong timing gives wrong pictures, or none."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from acquisition.capture import capture
+from acquisition.protocol import Command, Mode
+from twin.link import IMAGE, TwinLink
+from twin.machine import TimingViolation
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+FIRMWARE = Path(__file__).parents[2] / "firmware"
+NUMBERED = np.arange(3695, dtype=np.uint16)
+CALL = Command(200, 30000, 1)
+
+
+@pytest.fixture
+def variant(tmp_path: Path) -> Callable[[str, str, str], Path]:
+    """Compile the firmware with one text replaced in one file."""
+
+    def build(file: str, text: str, replacement: str) -> Path:
+        folder = tmp_path / "firmware"
+        shutil.copytree(FIRMWARE, folder, ignore=shutil.ignore_patterns("build*"))
+        shutil.copy(FIRMWARE.parent / "pyproject.toml", tmp_path)
+        source = (folder / file).read_text()
+        assert source.count(text) == 1, text
+        (folder / file).write_text(source.replace(text, replacement))
+        make = ["make", "-s", "-C", str(folder), f"ZIG={sys.executable} -m ziglang"]
+        subprocess.run(make, check=True, capture_output=True)
+        return folder / "build" / IMAGE
+
+    return build
+
+
+def elements(image: Path, command: Command = CALL) -> np.ndarray[tuple[int], np.dtype[np.uint16]]:
+    with TwinLink(image=image) as link:
+        link.machine._digitise_python = lambda _charge, _time: NUMBERED
+        return next(capture(link, command)).elements
+
+
+def test_a_slow_adc_skips_elements(variant: Callable[[str, str, str], Path]) -> None:
+    image = variant("sensor.c", "TIM4->ARR = ELEMENT_CYCLES - 1u", "TIM4->ARR = ELEMENT_CYCLES")
+    # 85 cycles a sample, 84 an element
+    found = elements(image)
+    assert found[0] == 0
+    at = np.arange(3000)
+    assert np.abs(found[at].astype(int) - at * 85 // 84).max() <= 1
+
+
+def test_an_adc_that_starts_early_reads_everything_late(
+    variant: Callable[[str, str, str], Path],
+) -> None:
+    """The published firmware starts it with the ICG pulse: its spikes are five pixels late."""
+    image = variant("sensor.c", "TIM2->CCR1 = ADC_START;", "TIM2->CCR1 = 9u;")
+    # 9 clocks too early, 2.25 elements
+    found = elements(image)
+    assert found[:2].min() >= 3694  # idle: there is nothing on the output yet
+    assert found[2:5].tolist() == [0, 1, 2]
+
+
+def test_a_short_sh_pulse_is_refused(variant: Callable[[str, str, str], Path]) -> None:
+    image = variant("sensor.c", "TIM2->CCR2 = SH_PULSE;", "TIM2->CCR2 = 3u;")
+    with pytest.raises(TimingViolation, match="t3"):
+        elements(image)
+
+
+def test_icg_out_of_phase_with_fm_is_refused(variant: Callable[[str, str, str], Path]) -> None:
+    image = variant("sensor.c", "TIM3->CCMR2 = TIM_CCMR2_OC3M_PWM2;", "TIM3->CCMR2 = 0x0060u;")
+    with pytest.raises(TimingViolation, match="t4"):
+        elements(image)
+
+
+def test_sh_that_does_not_divide_icg_is_refused(
+    variant: Callable[[str, str, str], Path],
+) -> None:
+    image = variant(
+        "sensor.c", "timer_prepare(TIM2, sh, SH_DELAY);", "timer_prepare(TIM2, sh + 1u, SH_DELAY);"
+    )
+    with pytest.raises(TimingViolation, match="SH"):
+        elements(image)
+
+
+def test_an_led_that_is_never_lit_is_not_seen(variant: Callable[[str, str, str], Path]) -> None:
+    image = variant("lights.c", "    lights_on(step->leds);\n", "")
+    with TwinLink(image=image) as link:
+        frame = next(capture(link, Command(200, 20000, 2, mode=Mode.STREAM)))
+    assert np.ptp(frame.pixels) < 40
