@@ -133,8 +133,8 @@ def test_leds_of_one_frame_have_their_own_exposures() -> None:
         readouts = link.machine.readouts
         lit = readouts[readouts["sampled"] > 0][-1]["lit"] / CLOCK * 4e6
     assert frame.leds == 3
-    assert lit[1] == pytest.approx(150, abs=8)
-    assert lit[2] == pytest.approx(50, abs=8)
+    assert lit[1] == pytest.approx(150, abs=2)
+    assert lit[2] == pytest.approx(50, abs=2)
 
 
 def test_chain_leds_light_through_the_shift_registers() -> None:
