@@ -51,7 +51,7 @@ run: setup
 	$(BIN)/python -m raytransfer --output build
 	$(BIN)/linetrack capture --link twin -i 30000 -s 100 -n 2 -o build/output
 	$(BIN)/linetrack plot build/output00001.dat build/output00002.dat --save build/output.png
-	$(BIN)/linetrack live --link replay build/output --original --frames 2
+	$(BIN)/linetrack live --link replay build/output --frames 2
 	@echo "the chart as a picture: build/output.png"
 
 test: setup lint

@@ -26,7 +26,7 @@ class Binaries(BuildHookInterface):  # type: ignore[type-arg]
             return
         root = Path(self.root)
         zig = f"{sys.executable} -m ziglang cc"
-        make = ["make", "-C"]
+        make = ["make", "-B", "-C"]  # whatever was built here before is for this machine
         subprocess.run([*make, root / "firmware", f"ZIG={sys.executable} -m ziglang"], check=True)
         for machine in ("x86_64", "aarch64"):
             compiler = f"CC={zig} -target {machine}-linux-gnu.2.28"

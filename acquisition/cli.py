@@ -202,7 +202,7 @@ Leds = Annotated[
     typer.Option(
         "--leds",
         metavar="LIST",
-        help="With --stream: what is lit, frame by frame, over and over. CHANNEL:CLOCKS, joined by "
+        help="Streaming mode: what is lit, frame by frame, over and over. CHANNEL:CLOCKS, joined by "
         "+ within a frame and by , between frames; - is an unlit frame. Without :CLOCKS for the "
         "whole SH period.  \\[default: 0,1]",
     ),
@@ -222,7 +222,8 @@ def capture(
             "--count",
             "-n",
             metavar="N",
-            help="Frames, 1 to 65535. Original mode lights the last but one by the first LED and "
+            help="Read-outs, 1 to 65535; with --stream those that the link was too slow for count "
+            "too. Original mode lights the last but one by the first LED and "
             "the last by the second.  \\[default: 2; with --stream until --seconds or Ctrl-C]",
         ),
     ] = None,
@@ -233,7 +234,7 @@ def capture(
             "-o",
             metavar="NAME",
             help="NAME.h5: one HDF5 session. Anything else: prefix of .dat files, NAME00001.dat "
-            "and so on, which replace older ones.",
+            "and so on; as with the original program, they replace older ones.",
         ),
     ] = "output",
     link: Link = "spi",
@@ -296,10 +297,15 @@ def live(
     icg: Icg = None,
     sh: Sh = 100,
     link: Link = "spi",
-    original: Annotated[
-        bool,
-        typer.Option("--original", help="Original mode: two frames a command, for old firmware."),
-    ] = False,
+    stream: Annotated[
+        bool | None,
+        typer.Option(
+            "--stream/--original",
+            help="Streaming mode, or original: two frames a command. "
+            "\\[default: --stream; --original for .dat files]",
+            show_default=False,
+        ),
+    ] = None,
     leds: Leds = None,
     frames: Annotated[
         int | None, typer.Option("--frames", metavar="N", min=1, help="End after so many.")

@@ -461,12 +461,14 @@ def live(
     icg: int | None,
     sh: int,
     link: str,
-    original: bool,
+    stream: bool | None,
     leds: str | None,
     frames: int | None,
 ) -> int:
     """Show frames in the terminal as they come; returns the exit code."""
-    command = _command(sh, icg, None, None, leds, stream=not original)
+    if stream is None:
+        stream = link != "replay" or Path(argument or "").suffix.lower() in SESSION_SUFFIXES
+    command = _command(sh, icg, None, None, leds, stream=stream)
     options = {"realtime": True} if link == "replay" else {}
     console, tally, view = Console(), Tally(), _View()
     with open_link(link, argument, **options) as device, _keys() as pressed:

@@ -271,8 +271,8 @@ class SpiLink(_Closing):
                 return False
             if self._polling:
                 time.sleep(min(_POLL, left))
-            else:
-                self._edge.wait(left)
+            elif self._edge.wait(left):
+                return True  # the published firmware's pulse may be over by now
 
     def _open_gpio(self) -> Any:
         if self._gpio is None:

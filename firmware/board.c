@@ -13,6 +13,8 @@ void clock_init(void)
 {
     FLASH->ACR = (FLASH_WAIT_STATES << FLASH_ACR_LATENCY) | FLASH_ACR_PRFTEN | FLASH_ACR_ICEN |
                  FLASH_ACR_DCEN;
+    while ((FLASH->ACR >> FLASH_ACR_LATENCY & 7u) != FLASH_WAIT_STATES) {
+    }
     RCC->PLLCFGR = (PLL_M << RCC_PLLCFGR_PLLM) | (PLL_N << RCC_PLLCFGR_PLLN) |
                    (PLL_P_DIV4 << RCC_PLLCFGR_PLLP) | (PLL_Q << RCC_PLLCFGR_PLLQ);
     RCC->CR |= RCC_CR_PLLON;

@@ -24,8 +24,9 @@ struct frame *frame_take(void)
 {
     const uint32_t masked = irq_save();
     uint32_t n = 0;
-    while (n < FRAMES - 1u && frames[n].in_use)
-        n++;
+    while (frames[n].in_use)
+        if (++n == FRAMES)
+            __builtin_trap(); /* cannot be, see FRAMES */
     frames[n].in_use = true;
     frames[n].stale = false;
     irq_restore(masked);

@@ -72,8 +72,7 @@ static void arm(struct frame *frame, bool offer)
 {
     armed = frame;
     offered = offer;
-    if (stream)
-        pin_low(READY_PORT, READY_PIN);
+    pin_low(READY_PORT, READY_PIN); /* each offer has an edge of its own */
     stop();
     dma_barrier();
     RCC->APB1RSTR = RCC_APB1RSTR_SPI2RST;
@@ -87,7 +86,7 @@ static void arm(struct frame *frame, bool offer)
     SPI2->CR2 = SPI_CR2_RXDMAEN | SPI_CR2_TXDMAEN;
     SPI2->CR1 = SPI_CR1_SSM | SPI_CR1_SPE; /* slave, mode 0, always selected */
     watch_clock();
-    if (stream && offer)
+    if (offer)
         pin_high(READY_PORT, READY_PIN);
 }
 
@@ -161,8 +160,6 @@ void link_frame(struct frame *frame)
         frame_release(armed);
         arm(frame, true);
     }
-    if (!stream && frame != &status_frame && frame->in_use)
-        pin_high(READY_PORT, READY_PIN);
     irq_restore(masked);
 }
 
@@ -227,12 +224,6 @@ void link_abandon(void)
     irq_restore(masked);
 }
 
-void link_icg_edge(void)
-{
-    if (!stream)
-        pin_low(READY_PORT, READY_PIN);
-}
-
 /* A transfer is through; `head` has its beginning. */
 static void complete(void)
 {
@@ -245,8 +236,7 @@ static void complete(void)
         armed = &status_frame;
         offered = false;
     } else {
-        /* not only at the next ICG edge: a host that looks at the level would read a frame twice */
-        pin_low(READY_PORT, READY_PIN);
+        offered = false;
         watch_clock(); /* the next transfer may come at once */
     }
     irq_restore(masked);
@@ -261,7 +251,6 @@ static void complete(void)
         frame_release(armed);
         arm(queued, true);
         queued = NULL;
-        pin_high(READY_PORT, READY_PIN);
     }
     irq_restore(masked);
 }
@@ -290,8 +279,7 @@ void EXTI15_10_IRQHandler(void)
         EXTI->IMR = 0;
         EXTI->PR = SCK_LINE;
         busy = true;
-        if (stream)
-            pin_low(READY_PORT, READY_PIN);
+        pin_low(READY_PORT, READY_PIN);
     }
     irq_restore(masked);
 }
@@ -331,9 +319,10 @@ void link_tick(void)
         if (queued) {
             frame_release(armed);
             armed = queued;
+            offered = true;
             queued = NULL;
         }
-        arm(armed, true);
+        arm(armed, offered);
     } else {
         if (armed != &status_frame && !status_due) {
             arm(armed, true); /* once more, so that a broken transfer costs its own frame only */

@@ -13,7 +13,7 @@ void link_status(uint32_t refusal);   /* answer to a command; stream framing onl
 void link_framing(bool stream);       /* of the next transfer */
 bool link_streams(void);
 void link_abandon(void);     /* no frame of before is offered any more */
-void link_icg_edge(void);    /* original mode: the offer ends with the period */
+    /* original mode: the offer ends with the period */
 void link_tick(void);        /* every TICK_US */
 
 void command_received(const uint8_t *bytes); /* in main.c; COMMAND_SIZE bytes */

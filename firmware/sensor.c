@@ -333,7 +333,6 @@ static void icg_edge(void)
     TIM2->DIER = 0;
     edge_time += icg_period;
     HEARTBEAT_PORT->ODR ^= 1u << HEARTBEAT_PIN;
-    link_icg_edge();
     switch (phase) {
     case FLUSH:
         if (++edges == FLUSH_PULSES)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from acquisition.links import LinkError
+from acquisition.links import LinkError, LinkUnavailable
 from twin.machine import CLOCK, Machine
 from twin.sensor import Electronics, SensorModel
 from twin.world import CHANNELS, World
@@ -39,10 +39,7 @@ def firmware_image() -> Path:
     for path in (package / IMAGE, package.parent / "firmware" / "build" / IMAGE):
         if path.is_file():
             return path
-    raise FileNotFoundError(
-        f"{IMAGE} is not built: run `make setup` in the project's folder, or "
-        "`make -C firmware CROSS=arm-none-eabi-` with gcc-arm-none-eabi installed"
-    )
+    raise FileNotFoundError(f"{IMAGE} is not built: run `make setup` in the project's folder")
 
 
 class TwinLink:
@@ -168,4 +165,7 @@ def open_twin(argument: str | None = None, **options: Any) -> TwinLink:
     """Open the twin for ``--link twin``; it takes no argument."""
     if argument is not None:
         raise ValueError(f"--link twin takes no argument, not {argument!r}")
-    return TwinLink(**options)
+    try:
+        return TwinLink(**options)
+    except (FileNotFoundError, ImportError) as error:
+        raise LinkUnavailable(str(error)) from error

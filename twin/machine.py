@@ -114,12 +114,12 @@ class Violation(NamedTuple):
 def _load() -> tuple[ctypes.CDLL, ctypes.CDLL]:
     spec = importlib.util.find_spec("unicorn")
     if spec is None or not spec.submodule_search_locations:
-        raise ImportError("the twin needs unicorn: pip install 'linetrack[twin]'")
+        raise ImportError("the twin needs unicorn: pip install unicorn")
     folder = Path(next(iter(spec.submodule_search_locations))) / "lib"
     unicorn = ctypes.CDLL(str(folder / "libunicorn.so.2"))
     path = Path(__file__).parent / "core" / "build" / f"libtwin-{platform.machine()}.so"
     if not path.exists():
-        raise ImportError(f"{path} is missing: build it with `make -C twin/core`")
+        raise ImportError(f"{path} is missing: run `make setup` in the project's folder")
     core = ctypes.CDLL(str(path))
     pointer, u8, u32, u64 = ctypes.c_void_p, ctypes.c_uint8, ctypes.c_uint32, ctypes.c_uint64
     signatures: dict[str, tuple[Any, list[Any]]] = {
@@ -153,7 +153,7 @@ def _load() -> tuple[ctypes.CDLL, ctypes.CDLL]:
     sizes = [ctypes.sizeof(_Config)]
     sizes += [t.itemsize for t in (_EDGE, _EXCEPTION, _VIOLATION, _READOUT)]
     if [core.twin_sizes(i) for i in range(5)] != sizes:
-        raise ImportError(f"{path} does not fit twin/machine.py: run `make -C twin/core`")
+        raise ImportError(f"{path} does not fit twin/machine.py: run `make setup`")
     return unicorn, core
 
 

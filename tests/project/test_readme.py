@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import doctest
 import re
+import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 from raytransfer.thesis import claims
@@ -34,6 +37,28 @@ def test_links_and_commands_exist() -> None:
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     for target in set(re.findall(r"\bmake ([a-z]+)", README)):
         assert re.search(rf"^{target}:", makefile, flags=re.MULTILINE), f"make {target}"
+
+
+def test_linetrack_commands_run(tmp_path: Path) -> None:
+    lines = [
+        line.partition("#")[0].strip()
+        for block in re.findall(r"```sh\n(.*?)```", README, flags=re.DOTALL)
+        for line in block.splitlines()
+        if line.startswith(".venv/bin/linetrack")
+    ]
+    assert {shlex.split(line)[1] for line in lines} == {
+        "capture",
+        "plot",
+        "info",
+        "live",
+        "convert",
+    }
+    for line in lines:
+        words = shlex.split(line)
+        words[0] = str(Path(sys.executable).with_name("linetrack"))
+        if words[1] == "live":
+            words += ["--frames", "4"]  # or it waits for a key
+        subprocess.run(words, cwd=tmp_path, check=True, capture_output=True, timeout=120)
 
 
 def test_every_notebook_is_listed() -> None:

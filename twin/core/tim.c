@@ -12,6 +12,8 @@
 #define URS 4u
 #define OPM 8u
 #define ARPE 0x80u
+#define SMS_RESET 4u
+#define SMS_TRIGGER 6u
 #define TRIGGER_DELAY 2u /* clocks from a master's TRGO to the slave's counter: resynchronisation */
 
 static const uint8_t irq_of[TIMERS] = {28, 29, 30, 50};
@@ -163,7 +165,9 @@ static uint32_t advance(struct machine *m, unsigned n, uint64_t time) {
 static bool waits_for(const struct machine *m, unsigned slave, unsigned master) {
     const struct tim *s = &m->tim[slave];
     uint32_t source = (s->smcr >> 4) & 7;
-    return (s->smcr & 7) == 6 && !running(s) && source < 4 && itr[slave][source] == master;
+    uint32_t mode = s->smcr & 7;
+    bool listens = (mode == SMS_TRIGGER && !running(s)) || (mode == SMS_RESET && running(s));
+    return listens && source < 4 && itr[slave][source] == master;
 }
 
 static int adc_source(unsigned n, unsigned channel) {
@@ -262,13 +266,30 @@ static void stop(struct machine *m, unsigned n, uint64_t time) {
     t->version++;
 }
 
+/* Reset mode: an update event, and the counter from 0. */
+static void begin_anew(struct machine *m, unsigned n, uint64_t time) {
+    struct tim *t = &m->tim[n];
+    advance(m, n, time);
+    if (!(t->cr1 & URS)) t->sr |= UIF;
+    load_shadows(t);
+    t->base_count = 0;
+    t->phase = 0;
+    t->base = t->done = time + TRIGGER_DELAY * m->rcc.timers;
+    for (unsigned i = 0; i < 4; i++)
+        if (mode_of(t, i) >= 6) t->ref[i] = level_of(t, i, 0);
+    t->version++;
+}
+
 /* The trigger output rises. */
 static void trgo(struct machine *m, unsigned n, uint64_t time) {
     if (adc_trgo(n) >= 0 && adc_listens(m) == adc_trgo(n)) adc_trigger(m, time);
     for (unsigned s = 0; s < TIMERS; s++) {
         if (!waits_for(m, s, n)) continue;
         m->tim[s].sr |= 0x40u;
-        start(m, s, time + TRIGGER_DELAY * m->rcc.timers);
+        if (running(&m->tim[s]))
+            begin_anew(m, s, time);
+        else
+            start(m, s, time + TRIGGER_DELAY * m->rcc.timers);
         irq(m, s);
         if (((m->tim[s].cr2 >> 4) & 7) == 1) trgo(m, s, time);
         decide(m, s);
@@ -423,8 +444,9 @@ void tim_write(struct machine *m, unsigned n, uint32_t offset, uint32_t value) {
         break;
     case 0x08:
         if (!allowed_bits(m, address, value, 0x77)) break;
-        if ((value & 7) && ((value & 7) != 6 || (value & 0x40) || itr[n][(value >> 4) & 3] == 0xFF))
-            fail(m, "%s = 0x%X: only trigger mode from ITRx is modelled",
+        if ((value & 7) && (((value & 7) != SMS_TRIGGER && (value & 7) != SMS_RESET) ||
+                            (value & 0x40) || itr[n][(value >> 4) & 3] == 0xFF))
+            fail(m, "%s = 0x%X: only trigger and reset mode from ITRx are modelled",
                  register_name(m, address), value);
         t->smcr = value;
         break;
