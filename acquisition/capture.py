@@ -49,6 +49,7 @@ _RESET: Final = 1.2e-6 * PROTOCOL.stream.original_stall_us  # s; in original mod
 _FRUITLESS: Final = 8  # transfers without a good frame before the command is sent again
 _UNCONFIRMED: Final = 8  # frames until a command that nothing came of is sent again
 _SEQUENCES: Final = 1 << 32
+_SLICE: Final = 0.1  # s; how long an interruption may go unnoticed
 _ZEROS: Final = {size: bytes(size) for size in (ORIGINAL_SIZE, STREAM_SIZE)}
 
 
@@ -202,6 +203,7 @@ class Capture:
         self._given_timeout = timeout
         self._retries = retries
         self._on_corrupt = on_corrupt
+        self._interrupted = False
         self._attempts = 0
         self._number = -1  # of the last frame delivered
         self._lost = False
@@ -241,6 +243,35 @@ class Capture:
     def close(self) -> None:
         """End the capture: an unfinished stream is stopped. The link stays open."""
         self._frames.close()
+
+    def interrupt(self) -> None:
+        """End the iteration soon, from another thread or a signal handler.
+
+        A `next` that waits ends as after the last frame, within 0.2 s even if the device is
+        silent; an unfinished stream is stopped. A second call does nothing.
+        """
+        self._interrupted = True  # no lock: a signal handler may run while one is held
+
+    def _check(self) -> None:
+        if self._interrupted:
+            raise LinkEnded("the capture was interrupted")
+
+    def _pause(self, seconds: float) -> None:
+        pause(self._link, seconds)
+        self._check()
+
+    def _wait_ready(self, timeout: float) -> bool:
+        """As the link's; where time is the host's, an interruption is noticed meanwhile."""
+        self._check()
+        step = timeout if hasattr(self._link, "sleep") else _SLICE
+        while timeout > step:
+            if self._link.wait_ready(step):
+                return True
+            timeout -= step
+            self._check()
+        ready = self._link.wait_ready(timeout)
+        self._check()
+        return ready
 
     @property
     def command(self) -> Command:
@@ -310,11 +341,11 @@ class Capture:
         data = bytearray(replace(self._command, count=count).encode(ORIGINAL_SIZE))
         if self._firmware == "original":  # it sends one more
             data[11:13] = (count - 1).to_bytes(2, "big")
-        pause(self._link, _BREATH)
+        self._pause(_BREATH)
         self._link.transfer(bytes(data))
 
     def _wait(self) -> bool:
-        if self._link.wait_ready(self._timeout):
+        if self._wait_ready(self._timeout):
             return True
         self.statistics.timeouts += 1
         self._attempts += 1
@@ -327,7 +358,7 @@ class Capture:
             raise LinkTimeout(self._explanation())
         self.statistics.restarts += 1
         self._lost = True
-        pause(self._link, _RESET)
+        self._pause(_RESET)
 
     def _explanation(self) -> str:
         found = self.statistics
@@ -397,7 +428,7 @@ class Capture:
         """Send a whole command to a device in whatever mode."""
         self._pending, self._queued, self._age, self._tries = command, None, 0, 1
         self._running, self._settled = True, False
-        pause(self._link, _BREATH)
+        self._pause(_BREATH)
         self._link.transfer(replace(command, count=self._left()).encode(ORIGINAL_SIZE))
 
     def _left(self) -> int:
@@ -418,7 +449,7 @@ class Capture:
     def _next_frame(self) -> Frame | None:
         """Do one transfer; None if it brought no frame to deliver."""
         link, statistics = self._link, self.statistics
-        ready = link.wait_ready(self._timeout)
+        ready = self._wait_ready(self._timeout)
         statistics.timeouts += not ready
         # A stream that ran until now may have a frame though the line is stuck: look, once.
         stuck = not ready and self._started and self._fruitless == 0
@@ -442,7 +473,7 @@ class Capture:
             if stuck:
                 self._repeat()
             else:
-                pause(link, _QUIET)
+                self._pause(_QUIET)
             return None
         if isinstance(item, Status):
             self._answered(item)
@@ -570,7 +601,8 @@ class Capture:
         last = replace(self._command, count=1, sequence=[{}])
         with suppress(LinkError, OSError):
             pause(self._link, _QUIET)
-            self._link.wait_ready(2 * self._command.icg_period / self._clock)
+            longest = _SLICE if self._interrupted else float("inf")
+            self._link.wait_ready(min(2 * self._command.icg_period / self._clock, longest))
             self._link.transfer(last.encode(STREAM_SIZE))
 
 

@@ -201,6 +201,14 @@ static void adc_prepare(void)
     ADC1->CR2 = adc;
 }
 
+/* A conversion was not fetched in time: the ADC asks DMA for no more, and the read-out is lost. */
+static void adc_recover(void)
+{
+    adc_stop();
+    done = begun;
+    adc_prepare();
+}
+
 /* TIM5's interrupt, before ADC_START. */
 static void adc_arm(void)
 {
@@ -323,6 +331,8 @@ static void begin(void)
 static void icg_edge(void)
 {
     if (phase == READ) {
+        if (ADC1->SR & ADC_SR_OVR)
+            adc_recover();
         adc_arm(); /* the one thing that cannot wait */
         if (plan->mode == MODE_STREAM && exposed.leds)
             while (TIM5->CNT < SH_EDGE - 2u) { /* what it takes comes on top; later, it would light the next frame */

@@ -165,6 +165,7 @@ struct adc {
     reg JDR4, DR;                   /* 0x48 */
 };
 #define ADC1 ((struct adc *)0x40012000u)
+#define ADC_SR_OVR (1u << 5)
 #define ADC_CR2_ADON (1u << 0)
 #define ADC_CR2_DMA (1u << 8)
 #define ADC_CR2_DDS (1u << 9)

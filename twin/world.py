@@ -42,8 +42,8 @@ class Led:
     position : tuple of float
         Room x, y and z, mm.
     power : float
-        Radiant power while lit, W. The thesis names none; 0.25 W fills some 60 % of the sensor's
-        well in 25 µs from 1.3 m.
+        Radiant power while lit, W. The thesis names none; 0.25 W leaves some 36,000 electrons in
+        a pixel in 25 µs from 1.3 m.
     wavelength : float
         µm.
     facing : float

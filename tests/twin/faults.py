@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import TYPE_CHECKING, Any
@@ -34,7 +34,7 @@ class FaultyLink(TwinLink):
 
     def __init__(self, seed: int, **options: Any) -> None:
         self.rng = np.random.Generator(np.random.PCG64(seed))
-        self.readouts: deque[bytes] = deque(maxlen=64)
+        self.readouts: dict[bytes, tuple[float, int]] = {}  # pixels: time of transfer, LEDs
         self.fault: str | None = None
         self.over = 0.0  # virtual time at which the last fault was over
         self.struck: Counter[str] = Counter()
@@ -45,7 +45,14 @@ class FaultyLink(TwinLink):
             charge: NDArray[np.float64], dark_seconds: float
         ) -> tuple[NDArray[np.uint16], int]:
             codes, idle = clean(charge, dark_seconds)
-            self.readouts.append(codes[LEADING : LEADING + PIXELS].tobytes())
+            last = self.machine.readouts[-1]
+            leds = sum(1 << int(source) - 1 for source in np.flatnonzero(last["lit"]) if source)
+            self.readouts[codes[LEADING : LEADING + PIXELS].tobytes()] = (
+                last["transfer"] / CLOCK,
+                leds,
+            )
+            while len(self.readouts) > 64:
+                self.readouts.pop(next(iter(self.readouts)))
             return codes, idle
 
         self.sensor.digitise = remembered  # type: ignore[method-assign]
@@ -205,17 +212,21 @@ def torture(seed: int, faults: int, kinds: tuple[str, ...], *, between: int = 2)
         frames = Capture(link, STREAM, retries=8)
         first = next(frames)
         booted, before = _device_clock(link, first), first.sequence
+        newest = first.sequence
         for _ in range(faults):
             kind = kinds[int(link.rng.integers(len(kinds)))]
             struck, start = link.struck[kind], link.machine.seconds
             link.strike(kind)
             try:
-                delivered = list(islice(frames, between + 1))
+                delivered = []
+                for frame in islice(frames, between + 1):
+                    report.corrupt += not _is_what_was_digitised(link, frame)
+                    report.corrupt += frame.sequence <= newest
+                    newest = frame.sequence
+                    delivered.append(frame)
             except LinkError as error:
                 raise RuntimeError(f"seed {seed}: no recovery from {kind!r}: {error}") from error
             silent = _silence(link, delivered, start)
-            for frame in delivered:
-                report.corrupt += not _is_what_was_digitised(link, frame)
             if link.struck[kind] > struck:
                 missing = delivered[-1].sequence - before - len(delivered)
                 report.missing.setdefault(kind, []).append(missing)
@@ -235,6 +246,13 @@ def _device_clock(link: FaultyLink, frame: Frame) -> float:
     return float(min(last - stamp, key=abs))
 
 
+def _is_what_was_digitised(link: FaultyLink, frame: Frame) -> bool:
+    """Whether pixels, LEDs and time are those of one read-out, not delivered before."""
+    time, leds = link.readouts.pop(frame.pixels.tobytes(), (0.0, -1))
+    on_the_way = link.machine.seconds - time
+    return frame.leds == leds and 0 < on_the_way < 0.06
+
+
 def _lost(link: FaultyLink, delivered: list[Frame], booted: float) -> int:
     """Count the read-outs since the fault that are not among the frames delivered."""
     period = STREAM.icg_period / 4e6
@@ -248,7 +266,3 @@ def _lost(link: FaultyLink, delivered: list[Frame], booted: float) -> int:
 def _silence(link: FaultyLink, delivered: list[Frame], start: float) -> float:
     period = STREAM.icg_period / 4e6
     return link.machine.seconds - start - (len(delivered) - 1) * period
-
-
-def _is_what_was_digitised(link: FaultyLink, frame: Frame) -> bool:
-    return frame.pixels.tobytes() in link.readouts

@@ -21,6 +21,7 @@ def main() -> int:
     runs = -(-arguments.cases // EACH)
     struck: Counter[str] = Counter()
     worst: Counter[str] = Counter()
+    silent: dict[str, float] = {}
     corrupt = 0
     with ProcessPoolExecutor() as pool:
         # one run in eight with what makes the device forget its mode: that takes longer
@@ -34,12 +35,15 @@ def main() -> int:
             corrupt += report.corrupt
             for kind, lost in report.lost.items():
                 worst[kind] = max(worst[kind], *lost)
+                silent[kind] = max(silent.get(kind, 0.0), *report.silent[kind])
             sys.stdout.write(f"\r{done * EACH} of {runs * EACH} faults, {corrupt} corrupt frames")
             sys.stdout.flush()
     sys.stdout.write("\n")
     for kind, count in sorted(struck.items()):
-        sys.stdout.write(f"{kind:18s} {count:7d} times, at most {worst[kind]} read-outs lost\n")
-    return int(corrupt > 0 or any(worst[kind] > 2 for kind in LINK_FAULTS))
+        sys.stdout.write(f"{kind:18s} {count:7d} times, at most {silent[kind]:.3f} s silent\n")
+    late = any(worst[kind] > 2 for kind in LINK_FAULTS)
+    late = late or any(silent.get(kind, 0.0) > 0.5 for kind in DEVICE_FAULTS)
+    return int(corrupt > 0 or late)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ def test_stream_survives_a_bad_link() -> None:
     print(f"\n{report}")
     assert report.corrupt == 0
     assert set(report.lost) == set(LINK_FAULTS)
-    assert sum(report.faults.values()) >= CASES * (1 - SHARE)
+    assert sum(report.faults.values()) >= round(CASES * (1 - SHARE))
     for kind, lost in report.lost.items():
         assert max(lost) <= 2, kind
     # a short or broken transfer costs at most its own frame
@@ -38,8 +38,9 @@ def test_stream_survives_resets_and_garbage_commands() -> None:
     print(f"\n{report}")
     assert report.corrupt == 0
     assert set(report.faults) == set(DEVICE_FAULTS)
+    assert sum(report.faults.values()) >= round(CASES * SHARE)
     for kind, silent in report.silent.items():
-        assert max(silent) < 1.0, kind
+        assert max(silent) < 0.5, kind
 
 
 def test_every_fault_is_one() -> None:

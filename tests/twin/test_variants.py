@@ -75,7 +75,9 @@ def test_a_short_sh_pulse_is_refused(variant: Callable[[str, str, str], Path]) -
 
 
 def test_icg_out_of_phase_with_fm_is_refused(variant: Callable[[str, str, str], Path]) -> None:
-    image = variant("sensor.c", "TIM3->CCMR2 = TIM_CCMR2_OC3M_PWM2;", "TIM3->CCMR2 = 0x0060u;")
+    image = variant(
+        "sensor.c", "TIM3->CCMR2 = TIM_CCMR2_OC3M_PWM2;", "TIM3->CCMR2 = 6u << 4; /* PWM mode 1 */"
+    )
     with pytest.raises(TimingViolation, match="t4"):
         elements(image)
 
@@ -88,6 +90,25 @@ def test_sh_that_does_not_divide_icg_is_refused(
     )
     with pytest.raises(TimingViolation, match="SH"):
         elements(image)
+
+
+@pytest.mark.parametrize("icg", [14800, 20000])  # the ADC runs on, or is stopped in between
+def test_a_missed_conversion_costs_one_frame(
+    variant: Callable[[str, str, str], Path], icg: int
+) -> None:
+    """After an overrun the ADC asks DMA for nothing more, until it is begun anew."""
+    arm = "adc_arm(); /* the one thing that cannot wait */"
+    # once, DMA is switched off on the ADC's side, with overrun detection on
+    fault = "adc_arm(); if (begun == 3u) ADC1->CR2 = (ADC1->CR2 & ~ADC_CR2_DMA) | (1u << 10);"
+    image = variant("sensor.c", arm, fault)
+    command = Command(200, icg, 9, mode=Mode.STREAM)
+    with TwinLink(image=image, spi_clock=20e6, host_latency=0) as link:
+        link.machine._digitise_python = lambda _charge, _time: NUMBERED
+        frames = list(capture(link, command))
+    numbers = [frame.sequence for frame in frames]
+    assert len(numbers) >= 7
+    assert numbers[-1] == 8
+    assert all(np.array_equal(frame.elements, NUMBERED[:3694]) for frame in frames)
 
 
 def test_an_led_that_is_never_lit_is_not_seen(variant: Callable[[str, str, str], Path]) -> None:

@@ -18,7 +18,7 @@ def test_the_default_room_is_the_documented_one() -> None:
     assert not world.moving
 
 
-def test_default_leds_fill_some_60_percent_of_the_well_in_25_us() -> None:
+def test_default_leds_leave_some_36000_electrons_in_25_us() -> None:
     rates = World().rates()
     assert 30_000 < rates[:2].max() * 25e-6 < 42_000
     assert not rates[2:].any()
