@@ -147,16 +147,16 @@ void link_frame(struct frame *frame)
         }
     } else if (frame->stale) {
         frame_release(frame);
-    } else if (transfer_begun() || status_due || (stream && armed == &status_frame && offered)) {
+    } else if (transfer_begun() || status_due || offered) {
+        /* What is offered stays so: its transfer may begin while another frame is armed. */
         enqueue(frame);
+        if (!stream && offered && !transfer_begun()) {
+            pin_low(READY_PORT, READY_PIN); /* hosts of the published firmware wait for an edge */
+            pin_high(READY_PORT, READY_PIN);
+        }
     } else if (stream) {
-        if (offered)
-            drop(armed);
         offer_frame(frame);
     } else {
-        if (queued)
-            frame_release(queued);
-        queued = NULL;
         frame_release(armed);
         arm(frame, true);
     }

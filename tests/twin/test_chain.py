@@ -113,6 +113,31 @@ def test_every_frame_is_read_once(icg: int, latency: float) -> None:
         assert_spike(frame, World(), frame.leds.bit_length() - 1)
 
 
+@pytest.mark.parametrize(("icg", "sealed"), [(14800, 188e-6), (20000, 3882.7e-6)])
+def test_a_transfer_may_begin_at_any_moment(icg: int, sealed: float) -> None:
+    """Also while the next frame becomes ready, so long after ICG's edge."""
+    command = Command(200, icg, 0, mode=Mode.STREAM)
+    with TwinLink(host_latency=0) as link, Capture(link, command) as frames:
+        next(frames)
+        transfer = link.transfer
+        for n in range(100):
+            # the frame that is offered meanwhile is not read before the next one is ready
+            assert link.machine.wait_pin("PB2", level=True, timeout=0.1)
+            assert link.machine.wait_pin("PA0", level=False, timeout=0.1)
+            assert link.machine.wait_pin("PA0", level=True, timeout=0.1)
+            moment = sealed + (n - 75) * 0.1e-6
+
+            def late(tx: bytes, moment: float = moment) -> bytes:
+                link.sleep(moment)
+                return transfer(tx)
+
+            link.transfer = late  # type: ignore[method-assign]
+            next(frames)
+            link.transfer = transfer  # type: ignore[method-assign]
+            next(frames)
+        assert frames.statistics.corrupt == 0
+
+
 def test_pixel_1_is_pixel_1() -> None:
     """A sensor whose elements say their own number is read in order, none late, none twice."""
     with TwinLink() as link:
