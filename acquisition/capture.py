@@ -10,9 +10,12 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, Literal, Self
+
+import numpy as np
 
 from acquisition.frames import MASTER_CLOCK, Frame, FrameFlags
 from acquisition.links import Link, LinkEnded, LinkError, LinkTimeout, pause
@@ -35,7 +38,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
     from types import TracebackType
 
-    import numpy as np
     from numpy.typing import NDArray
 
 Firmware = Literal["linetrack", "original"]
@@ -47,6 +49,8 @@ _QUIET: Final = 2e-6 * PROTOCOL.stream.stall_us  # s; the device gives a transfe
 _BREATH: Final = 1e-4  # s; after a transfer, until the device can take one that it did not offer
 _RESET: Final = 1.2e-6 * PROTOCOL.stream.original_stall_us  # s; in original mode, too
 _FRUITLESS: Final = 8  # transfers without a good frame before the command is sent again
+_HELD: Final = 16  # frames of original mode held back until all have come
+_SILENCE: Final = (4, 20e-3, 5e-3)  # read-outs, or s; slack, s: longer, no running stream is silent
 _UNCONFIRMED: Final = 8  # frames until a command that nothing came of is sent again
 _SEQUENCES: Final = 1 << 32
 _SLICE: Final = 0.1  # s; how long an interruption may go unnoticed
@@ -82,7 +86,7 @@ class CaptureStatistics:
     good : int
         Frames delivered without complaint.
     invalid : int
-        Original mode: frames delivered with the flag `FrameFlags.INVALID`.
+        Frames delivered with the flag `FrameFlags.INVALID`: in original mode, or so recorded.
     dropped : int
         Stream mode: read-outs missing in the sequence, lost by the device or on the link.
     corrupt : int
@@ -119,7 +123,9 @@ def capture(link: Link, command: Command, **options: Any) -> Iterator[Frame]:
     ------
     Frame
         In original mode every one of them, those that contradict themselves with
-        `FrameFlags.INVALID`; in stream mode only good ones.
+        `FrameFlags.INVALID`; up to 16 are held back until all have come, since one that is missed
+        would change the LEDs of the others: then they are asked for again. In stream mode only
+        good ones. From a recording, LEDs, exposures and timestamp are the recorded ones.
 
     Raises
     ------
@@ -152,7 +158,7 @@ class Capture:
     command : Command
     timeout : float, optional
         How long the device may be silent, s. By default six read-outs and a flush, and a quarter
-        of a second for the host.
+        of a second for the host; while a stream runs, four read-outs or 20 ms.
     retries : int, optional
         How often a command is sent again before the capture fails. Counted anew after each good
         frame.
@@ -207,6 +213,9 @@ class Capture:
         self._attempts = 0
         self._number = -1  # of the last frame delivered
         self._lost = False
+        # original mode
+        self._missing = 0  # frames still to come of the command under way
+        self._came: tuple[int, int] | None = None  # frames of the last command that came, asked for
         # stream mode
         self._command = command  # whose LED sequence is in force
         self._pending: Command | None = None  # sent, without an answer yet
@@ -319,20 +328,53 @@ class Capture:
         longest = max(self._command.icg_period, self._newest().icg_period)
         return _SLACK + (_FLUSH + _PERIODS * longest) / self._clock
 
+    @property
+    def _patience(self) -> float:
+        """How long to wait in stream mode: one that runs offers a frame with every read-out."""
+        if self._given_timeout is not None or not self._settled or self._pending is not None:
+            return self._timeout
+        readouts, shortest, slack = _SILENCE
+        return max(readouts * self._command.icg_period / self._clock, shortest) + slack
+
     # --- original mode
 
     def _original(self) -> Generator[Frame]:
-        command, total = self._command, self._command.count
+        """Hold frames back until all that the command asked for have come.
+
+        Only its place among them tells which LED lit a frame, and a frame that is missed would
+        give the others its place. Then those held back are asked for anew; at most the last 16,
+        since the LEDs are for the last two: what came before them is unlit in any case.
+        """
+        total = self._command.count
         before: NDArray[np.uint16] | None = None
-        with suppress(LinkEnded):
+        held: deque[Frame] = deque()
+        known = True
+        try:
             while self._number + 1 < total:
-                self._ask(total - self._number - 1)
-                while self._number + 1 < total and self._wait():
+                held.clear()
+                known, self._missing = True, total - self._number - 1
+                self._ask(self._missing)
+                while self._missing and self._wait():
                     elements = decode_elements(self._link.transfer(_ZEROS[ORIGINAL_SIZE]))
-                    frame = self._judged(command, elements, before)
-                    before = frame.elements
-                    self._attempts = 0
-                    yield frame
+                    twice = before is not None and np.array_equal(elements, before)
+                    before, known = elements, known and not twice
+                    held.append(self._judged(elements, twice=twice))
+                    self._missing -= 1
+                    if len(held) > _HELD or self._recorded is not None:
+                        yield self._delivered(held.popleft(), known=known)
+                asked = total - self._number - 1
+                self._came = (len(held), asked) if held else None
+                while held and not self._missing:
+                    yield self._delivered(held.popleft(), known=known)
+        except LinkEnded:
+            while held:
+                yield self._delivered(held.popleft(), known=False)
+
+    @property
+    def _recorded(self) -> Frame | None:
+        """The frame just transferred as it was recorded, where the link is a recording."""
+        recorded: Frame | None = getattr(self._link, "recorded", None)
+        return recorded
 
     def _ask(self, count: int) -> None:
         """Send the command for that many frames; not before the device has forgotten the last."""
@@ -368,6 +410,13 @@ class Capture:
                 f"{self._attempts} times: check MISO, MOSI, SCLK and ground, keep the wires short, "
                 "and try a lower SPI clock; is this project's firmware on the microcontroller?"
             )
+        if self._came is not None:
+            return (
+                f"only {self._came[0]} of {self._came[1]} frames came, though the command was sent "
+                f"{self._attempts} times: is the host too slow for a frame every "
+                f"{self._command.icg_period / self._clock:.3g} s? Give a longer ICG period (-i), "
+                "or use stream mode, which numbers its frames"
+            )
         return (
             f"no frame within {self._timeout:.3g} s, though the command was sent "
             f"{self._attempts} times: is the microcontroller powered and flashed, are PB2 and the "
@@ -375,35 +424,46 @@ class Capture:
             "on (dtparam=spi=on in /boot/firmware/config.txt)?"
         )
 
-    def _judged(
-        self, command: Command, elements: NDArray[np.uint16], before: NDArray[np.uint16] | None
-    ) -> Frame:
-        self._number += 1
-        exposures = command.leds(self._number)
-        frame = Frame(
+    def _judged(self, elements: NDArray[np.uint16], *, twice: bool) -> Frame:
+        """Make a frame of the elements; which number and which LEDs it has is not known yet."""
+        frame = self._recorded or Frame(
             elements,
-            sequence=self._number,
-            leds=sum(1 << channel for channel in exposures),
-            exposures=exposures,
-            sh_period=command.sh_period,
-            icg_period=command.icg_period,
+            sh_period=self._command.sh_period,
+            icg_period=self._command.icg_period,
             master_clock=self._clock,
-            utc_ns=time.time_ns(),
-            monotonic_ns=time.monotonic_ns(),
-            flags=self._lost_flag(),
         )
+        frame = frame.replaced(utc_ns=time.time_ns(), monotonic_ns=time.monotonic_ns())
         reasons = frame.invalid()
-        if before is not None and elements.tobytes() == before.tobytes():
+        if twice:
             reasons.append(
                 "the same as the frame before, to the last bit: it was read twice; does the "
                 "handshake line follow the device?"
             )
         if not reasons:
-            self.statistics.good += 1
             return frame
-        self.statistics.invalid += 1
-        flags = frame.flags | FrameFlags.INVALID
-        return replace(frame, flags=flags, reasons=tuple(reasons))
+        return replace(frame, flags=frame.flags | FrameFlags.INVALID, reasons=tuple(reasons))
+
+    def _delivered(self, frame: Frame, *, known: bool) -> Frame:
+        """Number a frame of original mode; known: its place tells its LEDs."""
+        self._number += 1
+        self._attempts = 0
+        self._count(frame.flags)
+        flags = frame.flags | self._lost_flag()
+        if self._recorded is not None:
+            return frame.replaced(sequence=self._number, flags=flags)
+        exposures = self._command.leds(self._number) if known else {}
+        return frame.replaced(
+            sequence=self._number,
+            leds=_mask(exposures),
+            exposures=exposures,
+            flags=flags if known else flags | FrameFlags.LOST,
+        )
+
+    def _count(self, flags: FrameFlags) -> None:
+        if flags & FrameFlags.INVALID:
+            self.statistics.invalid += 1
+        else:
+            self.statistics.good += 1
 
     def _lost_flag(self) -> FrameFlags:
         lost, self._lost = self._lost, False
@@ -427,8 +487,9 @@ class Capture:
     def _issue(self, command: Command) -> None:
         """Send a whole command to a device in whatever mode."""
         self._pending, self._queued, self._age, self._tries = command, None, 0, 1
-        self._running, self._settled = True, False
+        self._settled = False
         self._pause(_BREATH)
+        self._running = True
         self._link.transfer(replace(command, count=self._left()).encode(ORIGINAL_SIZE))
 
     def _left(self) -> int:
@@ -449,7 +510,7 @@ class Capture:
     def _next_frame(self) -> Frame | None:
         """Do one transfer; None if it brought no frame to deliver."""
         link, statistics = self._link, self.statistics
-        ready = self._wait_ready(self._timeout)
+        ready = self._wait_ready(self._patience)
         statistics.timeouts += not ready
         # A stream that ran until now may have a frame though the line is stuck: look, once.
         stuck = not ready and self._started and self._fruitless == 0
@@ -562,14 +623,19 @@ class Capture:
         self._attempts = self._fruitless = 0
         statistics = self.statistics
         statistics.dropped += gap
-        statistics.good += 1
         if gap:
             self._doubtful = True
             self._lost |= not frame.flags & FrameFlags.DROPPED
+        exposures, timestamp, flags = self._exposures(frame), frame.timestamp, frame.flags
+        if (recorded := self._recorded) is not None:
+            exposures, timestamp = recorded.exposures, recorded.timestamp
+            flags |= recorded.flags
+        self._count(flags)
         return frame.replaced(
             sequence=self._number,
-            exposures=self._exposures(frame),
-            flags=frame.flags | self._lost_flag(),
+            exposures=exposures,
+            timestamp=timestamp,
+            flags=flags | self._lost_flag(),
         )
 
     def _behind(self, frame: Frame) -> bool:

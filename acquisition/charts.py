@@ -46,6 +46,7 @@ COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E
 
 _NO_WINDOWS: Final = frozenset({"agg", "cairo", "pdf", "pgf", "ps", "svg", "template"})
 _MOST_IN_LEGEND: Final = 14
+_SHALLOW: Final = 32  # counts; a dip less deep is no spike
 _BRAILLE: Final = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]])
 
 
@@ -172,6 +173,38 @@ class Span:
             air = max(0.05 * (high - low), 16.0)
             self.low = min(self.low, max(0.0, low - air))
             self.high = max(self.high, high + air)
+
+
+def spike(pixels: NDArray[np.uint16]) -> tuple[float, int, float] | None:
+    """Find the deepest spike of a frame.
+
+    Parameters
+    ----------
+    pixels : ndarray of uint16
+
+    Returns
+    -------
+    centre : float
+        Centre of gravity of what lies below half of the depth, in pixels from 0.
+    width : int
+        Pixels at half of the depth.
+    depth : float
+        Counts from the median to the lowest value.
+
+    Instead of the three, None if nothing is far below the median.
+    """
+    below = np.median(pixels) - pixels
+    lowest = int(below.argmax())
+    depth = float(below[lowest])
+    if depth < _SHALLOW:
+        return None
+    outside = np.flatnonzero(below < depth / 2)
+    edge = int(np.searchsorted(outside, lowest))
+    first = int(outside[edge - 1]) + 1 if edge else 0
+    last = int(outside[edge]) if edge < outside.size else pixels.size
+    part = below[first:last]
+    centre = float((np.arange(first, last) * part).sum() / part.sum())
+    return centre, last - first, depth
 
 
 def text_chart(

@@ -12,8 +12,13 @@ import sys
 from pathlib import Path  # noqa: TC003  (typer looks at the annotations)
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-import typer
-from typer.core import TyperCommand, TyperGroup
+try:
+    import typer
+    from typer.core import TyperCommand, TyperGroup
+except ModuleNotFoundError as missing:  # seen by who types `linetrack`, not a traceback
+    raise SystemExit(
+        f"linetrack: the command line needs {missing.name}: pip install 'linetrack[capture]'"
+    ) from missing
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -28,18 +33,22 @@ USAGE: Final = 2
 DOUBTFUL: Final = 3
 """Exit code: finished, but some frames are invalid, damaged or lost on the way."""
 INTERRUPTED: Final = 130
-"""Exit code: ended with Ctrl-C before everything asked for was there."""
+"""Exit code: ended with Ctrl-C before everything asked for, or anything, was there."""
 
 _EPILOG: Final = """\
 [bold]Examples[/]
-  linetrack capture -i 30000 -s 100 -n 2 -o output        [dim]two frames, as .dat files[/]
+  linetrack capture -i 30000 -s 100 -n 2 -o output
+      [dim]two frames, as .dat files[/]
   linetrack capture --link twin --stream --seconds 10 -o run.h5
   linetrack plot output00001.dat output00002.dat
   linetrack live --link replay run.h5
 
 [bold]Exit codes[/]
-  0 done   1 link, device or file failed   2 wrong usage
-  3 done, but some frames are invalid, damaged or lost   130 ended with Ctrl-C"""
+  0 done; an endless capture ends so with Ctrl-C, too
+  1 link, device or file failed
+  2 wrong usage; nothing was done
+  3 done, but some frames are invalid, damaged or lost
+  130 Ctrl-C before everything asked for was there"""
 
 _CAPTURE: Final = """\
 [bold]Examples[/]
@@ -51,6 +60,8 @@ _CAPTURE: Final = """\
       [dim]from a recording: a session, a .dat file or the prefix of several[/]
   linetrack capture --stream --seconds 10 -o run.h5
       [dim]streaming at full rate into an HDF5 session[/]
+  linetrack capture --firmware original -n 2
+      [dim]from a board with the published firmware[/]
   linetrack capture --stream -n 300 --leds 0:80,1:80,- -o run.h5
       [dim]LED 0, LED 1, none, and so on, each lit for 80 clocks (20 us)[/]
 
@@ -79,9 +90,9 @@ Exit codes: linetrack --help"""
 
 _CONVERT: Final = """\
 [bold]Examples[/]
-  linetrack convert output*.dat run.h5      [dim]many files into one session[/]
-  linetrack convert run.h5 run.csv          [dim]one line per frame[/]
-  linetrack convert run.h5 frame            [dim]frame00001.dat and so on[/]
+  linetrack convert output*.dat run.h5    [dim]many files into one session[/]
+  linetrack convert run.h5 run.csv        [dim]one line per frame[/]
+  linetrack convert run.h5 frame          [dim]frame00001.dat and so on[/]
 
 Exit codes: linetrack --help"""
 
@@ -207,6 +218,15 @@ Leds = Annotated[
         "whole SH period.  \\[default: 0,1]",
     ),
 ]
+Firmware = Annotated[
+    str,
+    typer.Option(
+        "--firmware",
+        metavar="NAME",
+        help="Which one is on the board: linetrack, or original, the published one, which sends "
+        "one frame more than its command says and has no --stream.",
+    ),
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, only errors.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace files that are there.")]
 
@@ -223,8 +243,8 @@ def capture(
             "-n",
             metavar="N",
             help="Read-outs, 1 to 65535; with --stream those that the link was too slow for count "
-            "too. Original mode lights the last but one by the first LED and "
-            "the last by the second.  \\[default: 2; with --stream until --seconds or Ctrl-C]",
+            "too, and 0 is without end. Original mode lights the last but one by the first LED and "
+            "the last by the second.  \\[default: 2; with --stream 0, until --seconds or Ctrl-C]",
         ),
     ] = None,
     output: Annotated[
@@ -234,7 +254,8 @@ def capture(
             "-o",
             metavar="NAME",
             help="NAME.h5: one HDF5 session. Anything else: prefix of .dat files, NAME00001.dat "
-            "and so on; as with the original program, they replace older ones.",
+            "and so on; as with the original program, they replace older ones. Its folder must "
+            "exist.",
         ),
     ] = "output",
     link: Link = "spi",
@@ -254,12 +275,14 @@ def capture(
             help="Description of the lens head (TOML or JSON), to be kept in the session.",
         ),
     ] = None,
+    firmware: Firmware = "linetrack",
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
     """Capture frames into files.
 
-    What was captured before Ctrl-C or an error is kept.
+    What was captured before Ctrl-C or an error is kept. A capture without end (--stream without -n
+    and --seconds) is meant to end with Ctrl-C: its exit code is then 0.
     """
     _run("capture", **locals())
 
@@ -302,11 +325,12 @@ def live(
         typer.Option(
             "--stream/--original",
             help="Streaming mode, or original: two frames a command. "
-            "\\[default: --stream; --original for .dat files]",
+            "\\[default: --stream; --original for .dat files and --firmware original]",
             show_default=False,
         ),
     ] = None,
     leds: Leds = None,
+    firmware: Firmware = "linetrack",
     frames: Annotated[
         int | None, typer.Option("--frames", metavar="N", min=1, help="End after so many.")
     ] = None,
@@ -376,6 +400,8 @@ def _complain(error: Exception) -> None:
         isinstance(error, ValueError) and str(error)
     ):
         text = str(error)
+    elif isinstance(error, ModuleNotFoundError):
+        text = f"{error.name} is not installed: pip install 'linetrack[capture]'"
     else:
         text = (
             f"unexpected {type(error).__name__} ({error}); linetrack --debug ... shows where, "

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import select
 import signal
 import sys
 import threading
 import time
 import tomllib
-from contextlib import ExitStack, closing, contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from contextlib import ExitStack, closing, contextmanager, nullcontext, suppress
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import entry_points
 from itertools import islice
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -29,14 +32,25 @@ from acquisition.capture import Capture
 from acquisition.cli import DOUBTFUL, INTERRUPTED, UsageError
 from acquisition.dat import DatWriter, numbered, read_dat, write_dat
 from acquisition.frames import FULL_SCALE, MASTER_CLOCK, Frame, FrameFlags
-from acquisition.links import LinkError, open_link
+from acquisition.links import GROUP, LinkError, LinkUnavailable, open_link
 from acquisition.protocol import COUNT_MAX, ICG_MIN, Command, CommandError, Mode
-from acquisition.session import BATCH, Metadata, Session, SessionWriter, open_session, record
+from acquisition.session import (
+    BATCH,
+    Metadata,
+    Session,
+    SessionWriter,
+    open_session,
+    record,
+    require_h5py,
+)
 from acquisition.tables import csv_writer, read_csv
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 
+    from numpy.typing import NDArray
+
+    from acquisition.capture import Firmware
     from acquisition.links import Link
 
 SESSION_SUFFIXES: Final = frozenset({".h5", ".hdf5"})
@@ -44,7 +58,9 @@ ORIGINAL_ICG: Final = 30000
 """ICG period of original mode if none is given, master clocks: the thesis's."""
 
 _SAMPLE: Final = 1000  # frames of a session that `info` looks at
+_HINT: Final = "  q or Ctrl-C ends"
 _REFRESH: Final = 0.1  # s between two pictures of `live`
+_PATIENCE: Final = 1.0  # s after the first Ctrl-C; a later one interrupts whatever is going on
 
 
 # --- capture ------------------------------------------------------------------------------------
@@ -64,7 +80,8 @@ class Tally:
     frames, invalid : int
         Frames that came; those that contradict themselves.
     dropped, lost : int
-        Read-outs that the device skipped, since the link was still busy; others that are missing.
+        Read-outs that a newer one replaced on the device, since the link was still busy; those that
+        did not arrive.
     reason : str
         What is wrong with the first invalid frame.
     """
@@ -77,6 +94,7 @@ class Tally:
     reason: str = ""
     _first: Frame | None = None
     _last: Frame | None = None
+    _expected: int = 0
 
     def take(self, frame: Frame) -> None:
         """Count a frame."""
@@ -84,13 +102,13 @@ class Tally:
         if frame.flags & FrameFlags.INVALID:
             self.invalid += 1
             self.reason = self.reason or "; ".join(frame.invalid())
-        if self._last is not None:
-            gap = max(0, frame.sequence - self._last.sequence - 1)
-            if frame.flags & FrameFlags.DROPPED and not frame.flags & FrameFlags.LOST:
-                self.dropped += gap
-            else:  # in original mode nobody counts them
-                uncounted = frame.flags & FrameFlags.LOST and frame.timestamp is None
-                self.lost += gap or bool(uncounted)
+        gap = max(0, frame.sequence - self._expected)
+        if frame.flags & FrameFlags.DROPPED and not frame.flags & FrameFlags.LOST:
+            self.dropped += gap
+        else:  # in original mode nobody counts them
+            uncounted = frame.flags & FrameFlags.LOST and frame.timestamp is None
+            self.lost += gap or bool(uncounted)
+        self._expected = frame.sequence + 1
         if self._first is None:
             self._first = frame
         self._last = frame
@@ -120,19 +138,30 @@ class Tally:
         known = self._last is not None and self._last.timestamp is not None
         return (self.frames - 1) / self.seconds if known and self.seconds else 0.0
 
-    def line(self) -> str:
-        """All of it in one line."""
-        return ", ".join(
-            part
-            for part in (
-                f"{self.frames} frame{'' if self.frames == 1 else 's'}",
-                f"{self.rate:.1f}/s" if self.rate else "",
-                f"{self.dropped} dropped" if self.dropped else "",
-                f"[yellow]{self.lost} lost[/]" if self.lost else "0 lost",
-                f"[yellow]{self.corrupt} damaged[/]" if self.corrupt else "0 damaged",
-                f"[red]{self.invalid} invalid[/]" if self.invalid else "0 invalid",
-            )
-            if part
+    def line(self, asked: int | None = None, *, brief: bool = False) -> str:
+        """All of it in one line.
+
+        Parameters
+        ----------
+        asked : int, optional
+            How many there should be; told if they are fewer.
+        brief : bool
+            Leave out what is 0.
+        """
+        count = f"{self.frames} frame{'' if self.frames == 1 else 's'}"
+        if asked is not None and self.frames < asked:
+            count = f"{self.frames} of {asked} read-outs"
+        rate = f", {self.rate:.1f}/s" if self.rate else ""
+        dropped = f", {self.dropped} dropped" if self.dropped else ""
+        doubts = (
+            (self.lost, "lost", "yellow"),
+            (self.corrupt, "damaged", "yellow"),
+            (self.invalid, "invalid", "red"),
+        )
+        return f"{count}{rate}{dropped}" + "".join(
+            f", [{colour}]{number} {what}[/]" if number else f", 0 {what}"
+            for number, what, colour in doubts
+            if number or not brief
         )
 
 
@@ -148,21 +177,28 @@ def capture(
     seconds: float | None,
     leds: str | None,
     head: Path | None,
+    firmware: str,
     overwrite: bool,
     quiet: bool,
 ) -> int:
     """Capture frames into files; returns the exit code."""
+    published = _published(firmware, stream=stream)
     command = _command(sh, icg, count, seconds, leds, stream=stream)
     session = Path(output).suffix.lower() in SESSION_SUFFIXES
-    _check_target(Path(output), exists_is_wrong=session and not overwrite)
+    if session:
+        _check_target(Path(output), overwrite=overwrite, option="-o ")
+        require_h5py()
+    else:
+        _check_prefix(output, option="-o ")
     lens_system = None if head is None else _description(head)
     console = Console(stderr=True, quiet=quiet)
     error: BaseException | None = None
     with ExitStack() as stack:
-        device = stack.enter_context(open_link(link, argument))
-        source = stack.enter_context(Capture(device, command))
+        device = stack.enter_context(_open(link, argument))
+        source = Capture(device, command, firmware=published)
+        stack.callback(_close, source)
         tally = Tally(source)
-        pressed = stack.enter_context(_ctrl_c())
+        pressed = stack.enter_context(_ctrl_c(source))
         metadata = {
             "link": " ".join([link, *([argument] if argument else [])]),
             "command": _as_json(command),
@@ -173,13 +209,15 @@ def capture(
         if session:
             writer = _LateSession(Path(output), metadata, source, overwrite=overwrite)
         stack.callback(writer.close)
-        total = command.count or (seconds and round(seconds * command.frame_rate())) or None
-        stored = record(_until(source, seconds, command, pressed), _Counting(writer, tally))
-        update = stack.enter_context(_progress(console, total))
+        in_time = None if seconds is None else max(1, round(seconds * command.frame_rate()))
+        total = min((n for n in (command.count, in_time) if n), default=None)
+        over = threading.Event()
+        stored = record(_until(source, seconds, command, over), _Counting(writer, tally))
+        update = stack.enter_context(_progress(console, "capture", total))
         try:
             with closing(stored):
                 for _ in stored:
-                    update(tally)
+                    update(tally.frames, tally.line)
         except (Exception, KeyboardInterrupt) as caught:  # noqa: BLE001  (raised again below)
             error = caught
     kept, interrupted = tally.frames, pressed.is_set()
@@ -188,28 +226,67 @@ def capture(
     if not kept and error is None and not interrupted:
         error = LinkError("the link has nothing to send: is the recording empty?")
     if kept or interrupted:
-        console.print(f"{_where(output, kept, session=session)}: {tally.line()}", highlight=False)
+        line = tally.line(total if command.count else None)
+        where = _where(output, kept, session=session)
+        console.print(f"{where}: {line}", highlight=False, soft_wrap=True)
+    if kept and not session:
+        _warn_of_older(console, output, kept)
     if tally.reason:
         console.print(f"[red]invalid:[/] {escape(tally.reason)}", highlight=False, soft_wrap=True)
     if error is not None:
         raise error
-    if interrupted and total:
-        console.print(f"ended with Ctrl-C; {kept} of {total} frames are kept", highlight=False)
+    if interrupted and (total or not kept):
+        of = f" of {total}" if total else ""
+        console.print(f"ended with Ctrl-C; {kept}{of} frames are kept", highlight=False)
         return INTERRUPTED
-    if command.count > kept + tally.dropped + tally.lost and not interrupted:
+    missing = command.count > kept + tally.dropped + tally.lost
+    if missing and not interrupted and not over.is_set():
         console.print(f"[yellow]{command.count} frames were asked for[/]; the link had no more")
         return DOUBTFUL
     return DOUBTFUL if tally.doubtful else 0
 
 
+def _published(firmware: str, *, stream: bool) -> Firmware:
+    """Read the option --firmware."""
+    if firmware == "linetrack":
+        return "linetrack"
+    if firmware != "original":
+        raise UsageError(f"--firmware {firmware}: allowed are linetrack and original")
+    if stream:
+        raise UsageError("--firmware original: the published firmware knows no --stream")
+    return "original"
+
+
+def _open(link: str, argument: str | None, **options: Any) -> Link:
+    try:
+        return open_link(link, argument, **options)
+    except LinkUnavailable as error:
+        if link in entry_points(group=GROUP).names:
+            raise
+        raise UsageError(str(error)) from error
+
+
+def _close(source: Capture) -> None:
+    with suppress(ValueError):  # its thread hangs in the link: given up with the second Ctrl-C
+        source.close()
+
+
 @contextmanager
-def _ctrl_c() -> Iterator[threading.Event]:
-    """Yield what is set by the first Ctrl-C, which interrupts nothing; the second one does."""
-    pressed = threading.Event()
+def _ctrl_c(source: Capture) -> Iterator[threading.Event]:
+    """Let Ctrl-C end the capture, and yield what it sets.
+
+    It interrupts nothing but waiting; one that comes when that has not helped does.
+    """
+    pressed, first = threading.Event(), 0.0
 
     def note(*_: object) -> None:
-        pressed.set()
-        signal.signal(signal.SIGINT, before)
+        nonlocal first
+        if not pressed.is_set():
+            first = time.monotonic()
+            pressed.set()
+            source.interrupt()
+        elif time.monotonic() - first > _PATIENCE:
+            raise KeyboardInterrupt
 
     before = signal.signal(signal.SIGINT, note)
     try:
@@ -219,20 +296,19 @@ def _ctrl_c() -> Iterator[threading.Event]:
 
 
 def _until(
-    source: Capture, seconds: float | None, command: Command, pressed: threading.Event
+    source: Capture, seconds: float | None, command: Command, over: threading.Event
 ) -> Iterator[Frame]:
-    """Yield frames until Ctrl-C, or until one is later than the first by so many seconds."""
+    """Yield frames until one is later than the first by so many seconds; then `over` is set."""
     first: int | None = None
-    # as many read-outs as fit, whatever the rounding of the timestamps
-    end = None if seconds is None else (seconds - 0.5 / command.frame_rate()) * 1e9
+    # as many read-outs as fit, whatever the rounding of the timestamps; at least one
+    end = None if seconds is None else max(1, (seconds - 0.5 / command.frame_rate()) * 1e9)
     for frame in source:
         if end is not None and frame.timestamp is not None:
             first = frame.timestamp if first is None else first
             if frame.timestamp - first >= end:
+                over.set()
                 return
         yield frame
-        if pressed.is_set():
-            return
 
 
 class _Counting:
@@ -299,14 +375,47 @@ def _sequence(leds: str | None, sh_period: int) -> list[dict[int, int]]:
     return result
 
 
-def _check_target(path: Path, *, exists_is_wrong: bool) -> None:
+def _check_target(path: Path, *, overwrite: bool, option: str = "") -> None:
     """Find out before anything is captured that it cannot be written."""
     if not path.parent.is_dir():
-        raise UsageError(f"-o {path}: there is no folder {path.parent}; make it first")
+        raise UsageError(f"{option}{path}: there is no folder {path.parent}; make it first")
     if not os.access(path.parent, os.W_OK):
-        raise UsageError(f"-o {path}: the folder {path.parent} may not be written to")
-    if exists_is_wrong and path.exists():
-        raise UsageError(f"-o {path}: exists; take another name, or --overwrite")
+        raise UsageError(f"{option}{path}: the folder {path.parent} may not be written to")
+    if path.is_dir():
+        raise UsageError(f"{option}{path}: is a folder; name a file in it")
+    if not overwrite and path.exists():
+        raise UsageError(f"{option}{path}: exists; take another name, or --overwrite")
+
+
+def _check_prefix(prefix: str, *, option: str = "") -> None:
+    """The same for numbered files."""
+    if not prefix:
+        raise UsageError(f"{option}'': a name is needed, such as output for output00001.dat")
+    path = Path(prefix)
+    if path.suffix.lower() in (".dat", ".csv"):
+        raise UsageError(
+            f"{option}{prefix}: the files get numbers, and would be {numbered(prefix, 1)} and so "
+            f"on; give the prefix alone: {path.with_suffix('')}"
+        )
+    _check_target(numbered(prefix, 1), overwrite=True, option=option)
+
+
+def _highest(prefix: str) -> int:
+    """Largest number among a prefix's files, 0 if there are none."""
+    path = Path(f"{prefix}#")
+    name = re.compile(re.escape(path.name[:-1]) + r"([0-9]{5,})\.dat")
+    matches = (name.fullmatch(entry.name) for entry in path.parent.iterdir())
+    return max((int(match[1]) for match in matches if match), default=0)
+
+
+def _warn_of_older(console: Console, prefix: str, kept: int) -> None:
+    if (highest := _highest(prefix)) > kept:
+        console.print(
+            f"[yellow]older files remain,[/] up to {escape(str(numbered(prefix, highest)))}: a "
+            "replay would mix them in; delete them, or take another name",
+            highlight=False,
+            soft_wrap=True,
+        )
 
 
 def _description(path: Path) -> dict[str, Any]:
@@ -365,20 +474,23 @@ def _where(output: str, kept: int, *, session: bool) -> str:
 
 
 @contextmanager
-def _progress(console: Console, total: float | None) -> Iterator[Callable[[Tally], None]]:
+def _progress(
+    console: Console, what: str, total: float | None
+) -> Iterator[Callable[[int, Callable[[], str]], None]]:
+    """Yield a function that takes how many frames there are, and what tells more about them."""
     if console.quiet or not console.is_terminal:
-        yield lambda _: None
+        yield lambda *_: None
         return
-    columns = (TextColumn("capture"), BarColumn(), TextColumn("{task.fields[line]}"))
+    columns = (TextColumn(what), BarColumn(), TextColumn("{task.fields[line]}"))
     with Progress(*columns, console=console, transient=True) as progress:
-        task = progress.add_task("capture", total=total, line="waiting for the first frame")
+        task = progress.add_task(what, total=total, line="waiting for the first frame")
         shown = 0.0
 
-        def update(tally: Tally) -> None:
+        def update(frames: int, line: Callable[[], str]) -> None:
             nonlocal shown
             if time.monotonic() - shown >= _REFRESH:
                 shown = time.monotonic()
-                progress.update(task, completed=tally.frames, line=tally.line())
+                progress.update(task, completed=frames, line=line())
 
         yield update
 
@@ -389,8 +501,11 @@ def _progress(console: Console, total: float | None) -> Iterator[Callable[[Tally
 def plot(*, files: Sequence[Path], save: Path | None, frames: str | None, elements: bool) -> int:
     """Draw intensity charts; returns the exit code."""
     curves: list[tuple[str, Frame]] = []
+    sessions = [path for path in files if is_session(path)]
+    if frames is not None and not sessions:
+        raise UsageError(f"--frames {frames}: a .dat file holds one frame; only sessions have more")
     for path in files:
-        if is_session(path):
+        if path in sessions:
             with open_session(path) as session:
                 for index in _chosen(session, frames):
                     frame = session[index]
@@ -401,6 +516,7 @@ def plot(*, files: Sequence[Path], save: Path | None, frames: str | None, elemen
         charts.show_chart(curves, whole=elements)
     else:
         charts.save_chart(curves, str(save), whole=elements)
+        Console(stderr=True).print(f"wrote {escape(str(save))}", highlight=False, soft_wrap=True)
     return 0
 
 
@@ -439,17 +555,15 @@ def _chosen(session: Session, frames: str | None) -> list[int]:
                 )
                 raise UsageError(message)
         start, end = (n - 1 if n > 0 else n + count for n in numbers)
+        if start > end:
+            message = f"--frames {frames}: {part} ends before it begins; the smaller number first"
+            raise UsageError(message)
         result += range(start, end + 1)
     return result
 
 
 def _lit(frame: Frame) -> str:
-    return _leds(frame.leds)
-
-
-def _leds(mask: int) -> str:
-    channels = [str(n) for n in range(mask.bit_length()) if mask >> n & 1]
-    return f"LED {'+'.join(channels)}" if channels else "no LED"
+    return f"LED {'+'.join(map(str, frame.channels))}" if frame.channels else "no LED"
 
 
 # --- live ---------------------------------------------------------------------------------------
@@ -463,42 +577,44 @@ def live(
     link: str,
     stream: bool | None,
     leds: str | None,
+    firmware: str,
     frames: int | None,
 ) -> int:
     """Show frames in the terminal as they come; returns the exit code."""
+    published = _published(firmware, stream=bool(stream))
     if stream is None:
-        stream = link != "replay" or Path(argument or "").suffix.lower() in SESSION_SUFFIXES
+        stream = published != "original" and (
+            link != "replay" or Path(argument or "").suffix.lower() in SESSION_SUFFIXES
+        )
     command = _command(sh, icg, None, None, leds, stream=stream)
     options = {"realtime": True} if link == "replay" else {}
     console, tally, view = Console(), Tally(), _View()
-    with open_link(link, argument, **options) as device, _keys() as pressed:
-        source = _endless(device, command, tally)
+    with _open(link, argument, **options) as device, _keys() as pressed:
+        source = _endless(device, command, published, tally)
         screen = Live(console=console, auto_refresh=False, vertical_overflow="crop")
-        try:
-            with closing(source), screen if console.is_terminal else nullcontext():
-                shown = 0.0
+        with closing(source), screen if console.is_terminal else nullcontext():
+            shown = 0.0
+            with suppress(KeyboardInterrupt):
                 for frame in islice(source, frames):
                     tally.take(frame)
                     view.take(frame)
                     if console.is_terminal and time.monotonic() - shown >= _REFRESH:
                         shown = time.monotonic()
-                        screen.update(view.picture(console, tally), refresh=True)
+                        screen.update(view.picture(console, tally, hint=_HINT), refresh=True)
                     if pressed() == "q":
                         break
-                if console.is_terminal:
-                    screen.update(view.picture(console, tally), refresh=True)
-                else:
-                    console.print(view.picture(console, tally))
-        except KeyboardInterrupt:
-            pass
+            if console.is_terminal:
+                screen.update(view.picture(console, tally), refresh=True)
+            else:
+                console.print(view.picture(console, tally))
     return DOUBTFUL if tally.doubtful else 0
 
 
-def _endless(device: Link, command: Command, tally: Tally) -> Generator[Frame]:
+def _endless(device: Link, command: Command, firmware: Firmware, tally: Tally) -> Generator[Frame]:
     """Yield frames until there are no more; original mode is asked again and again."""
     more = True
     while more:
-        with Capture(device, command) as tally.source:
+        with Capture(device, command, firmware=firmware) as tally.source:
             more = False
             for frame in tally.source:
                 more = command.mode is Mode.ORIGINAL
@@ -516,7 +632,7 @@ class _View:
         self._latest[frame.leds] = frame
         self._span.take(frame.pixels)
 
-    def picture(self, console: Console, tally: Tally) -> Group:
+    def picture(self, console: Console, tally: Tally, *, hint: str = "") -> Group:
         plain = not console.encoding.startswith("utf")
         width = max(20, min(console.width, 240) - 6)
         most = max(1, (console.height - 2) // 6)
@@ -526,14 +642,14 @@ class _View:
         for number, mask in enumerate(shown):
             frame = self._latest[mask]
             pixels, colour = frame.pixels, charts.COLOURS[number % 6]
-            where = int(pixels.argmin())
             head = Text.assemble(
-                (_leds(mask), f"bold {colour}"),
-                f"  lowest {int(pixels[where])} at pixel {where}, dark {frame.dark_level:g}",
-                f", integration {frame.integration_time * 1e6:g} us",
+                (_lit(frame), f"bold {colour}"),
+                ("  invalid" if frame.flags & FrameFlags.INVALID else "", "bold red"),
+                f"  {_spike(pixels)}; dark {frame.dark_level:g}",
+                f", integration {_time(frame.integration_time)}",
+                no_wrap=True,
+                overflow="ellipsis",
             )
-            if frame.flags & FrameFlags.INVALID:
-                head.append("  invalid", "bold red")
             parts.append(head)
             lines = charts.text_chart(pixels, width, height, self._span, plain=plain)
             marks = {0: f"{self._span.high:.0f}", height - 1: f"{self._span.low:.0f}"}
@@ -541,11 +657,20 @@ class _View:
                 parts.append(Text.assemble((f"{marks.get(row, ''):>5} ", "dim"), (line, colour)))
             parts.append(Text("      " + _ruler(width), "dim"))
         hidden = len(self._latest) - len(shown)
-        foot = Text.from_markup(tally.line())
+        foot = Text.from_markup(tally.line(brief=True))
         if hidden:
             foot.append(f"  ({hidden} more LED patterns: make the window higher)")
-        foot.append("  q or Ctrl-C ends" if sys.stdin.isatty() else "", "dim")
+        foot.append(hint if sys.stdin.isatty() else "", "dim")
+        foot.no_wrap, foot.overflow = True, "ellipsis"
         return Group(*parts, foot)
+
+
+def _spike(pixels: NDArray[np.uint16]) -> str:
+    found = charts.spike(pixels)
+    if found is None:
+        return "no spike"
+    centre, width, depth = found
+    return f"spike at {centre:.1f}, {width} wide, {depth:.0f} deep"
 
 
 def _ruler(width: int) -> str:
@@ -651,7 +776,7 @@ def _about_session(session: Session) -> dict[str, str]:
     state = {
         "closed": "complete",
         "being written": "[yellow]being written[/] just now",
-        "cut off": "[yellow]cut off[/]: its writer ended without closing it; the frames are good",
+        "cut off": "[yellow]cut off[/]: its writer could not finish it; the frames are good",
     }[session.state]
     rows = {
         "file": f"session (HDF5), {state}",
@@ -674,11 +799,13 @@ def _about_session(session: Session) -> dict[str, str]:
     if span > 0:
         rows["rate"] = f"{(count - 1) / span:.6g} frames/s over {_time(span)}"
     rows["dropped"] = f"{gaps[own].sum()} read-outs, the link was busy"
-    rows["lost"] = f"{gaps[~own].sum()} read-outs"
+    rows["lost"] = f"{gaps[~own].sum()} read-outs, they did not arrive"
     invalid = int(np.count_nonzero(table["flags"] & int(FrameFlags.INVALID)))
-    patterns, numbers = np.unique(table["leds"], return_counts=True)
-    shown = [f"{_leds(int(m))}: {n}" for m, n in zip(patterns[:8], numbers[:8], strict=True)]
-    rows["lit"] = ", ".join(shown) + (" ..." if patterns.size > 8 else "")
+    _, firsts, numbers = np.unique(table["leds"], return_index=True, return_counts=True)
+    shown = [
+        f"{_lit(session[int(at)])}: {n}" for at, n in zip(firsts[:8], numbers[:8], strict=True)
+    ]
+    rows["lit"] = ", ".join(shown) + (" ..." if firsts.size > 8 else "")
     indices = np.unique(np.linspace(0, count - 1, min(count, _SAMPLE)).astype(int))
     lowest, highest, dark = FULL_SCALE, 0, []
     for frame in map(session.__getitem__, indices.tolist()):
@@ -705,38 +832,59 @@ def convert(*, files: Sequence[str], overwrite: bool, quiet: bool) -> int:
     if target in sources:
         raise UsageError(f"{target} is to be read and written at once")
     console = Console(stderr=True, quiet=quiet)
-    metadata: list[Metadata] = []
-    suffix = target.suffix.lower()
-    frames = _read_all(sources, metadata)
-    if suffix in SESSION_SUFFIXES:
-        _check_target(target, exists_is_wrong=not overwrite)
-        written = _to_session(frames, target, sources, metadata, overwrite=overwrite)
-        lost = ""
-    elif suffix == ".csv":
-        _check_target(target, exists_is_wrong=not overwrite)
-        written = _to_csv(frames, target)
-        lost = "firmware, wiring, lens head and command" if metadata else ""
+    suffix, lost = target.suffix.lower(), ""
+    if suffix in SESSION_SUFFIXES | {".csv", ".dat"}:
+        _check_target(target, overwrite=overwrite)
     else:
-        written = _to_dat(frames, output, overwrite=overwrite)
-        lost = "the frames' numbers, LEDs, times and flags"
-        lost = lost + "; firmware, wiring, lens head and command" if metadata else lost
-        if all(path.suffix.lower() == ".dat" for path in sources):
-            lost = ""
+        _check_prefix(output)
+        if not overwrite and (highest := _highest(output)):
+            name = numbered(output, highest)
+            raise UsageError(f"{name}: exists; take another name, or --overwrite")
+    sessions, total = _about(sources)
+    with _progress(console, "convert", total) as update:
+        frames = _shown(_read_all(sources), update)
+        if suffix in SESSION_SUFFIXES:
+            written = _to_session(frames, target, sources, sessions)
+        elif suffix == ".csv":
+            written = _to_csv(frames, target)
+            lost = "firmware, wiring, lens head and command" if sessions else ""
+        else:
+            written = _to_dat(frames, output)
+            lost = "the frames' numbers, LEDs, times and flags"
+            lost = lost + "; firmware, wiring, lens head and command" if sessions else lost
+            if all(path.suffix.lower() == ".dat" for path in sources):
+                lost = ""
     console.print(
         f"{escape(output)}: {written} frame{'' if written == 1 else 's'}"
         + (f"; [yellow]not kept:[/] {lost}" if lost else ""),
         highlight=False,
         soft_wrap=True,
     )
+    if suffix not in SESSION_SUFFIXES | {".csv", ".dat"}:
+        _warn_of_older(console, output, written)
     return 0
 
 
-def _read_all(sources: Iterable[Path], metadata: list[Metadata]) -> Iterator[Frame]:
-    """Yield the frames of all files; what sessions say about themselves goes into the list."""
+def _about(sources: Iterable[Path]) -> tuple[dict[Path, Metadata], int | None]:
+    """What the sessions say about themselves, and how many frames there are, if that is known."""
+    sessions: dict[Path, Metadata] = {}
+    total, known = 0, True
+    for path in sources:
+        if is_session(path):
+            with open_session(path) as session:
+                sessions[path] = session.metadata
+                total += len(session)
+        else:
+            total += 1
+            known = known and path.suffix.lower() != ".csv"
+    return sessions, total if known else None
+
+
+def _read_all(sources: Iterable[Path]) -> Iterator[Frame]:
+    """Yield the frames of all files."""
     for number, path in enumerate(sources):
         if is_session(path):
             with open_session(path) as session:
-                metadata.append(session.metadata)
                 yield from session
         elif path.suffix.lower() == ".csv":
             yield from read_csv(path)
@@ -744,26 +892,46 @@ def _read_all(sources: Iterable[Path], metadata: list[Metadata]) -> Iterator[Fra
             yield replace(read_dat(path), sequence=number)
 
 
+def _shown(
+    frames: Iterator[Frame], update: Callable[[int, Callable[[], str]], None]
+) -> Iterator[Frame]:
+    for number, frame in enumerate(frames, start=1):
+        update(number, f"{number} frames".__str__)
+        yield frame
+
+
+def _merged(sources: Sequence[Path], sessions: dict[Path, Metadata], clock: int) -> Metadata:
+    """What a session made from these files says: all that the sessions among them did."""
+    if len(sources) == 1 and sessions:
+        return sessions[sources[0]]
+    extra: dict[str, Any] = {"converted_from": [path.name for path in sources]}
+    if sessions:
+        extra["sessions"] = [{"file": p.name, **asdict(about)} for p, about in sessions.items()]
+    result = Metadata(link="files", extra=extra, master_clock=clock, wiring="")
+    if len(sessions) == len(sources):
+        first, *others = sessions.values()
+        for name in ("firmware_build", "command", "lens_system", "wiring"):
+            value = getattr(first, name)
+            if all(getattr(other, name) == value for other in others):
+                result = replace(result, **{name: value})
+    return result
+
+
 def _to_session(
     frames: Iterator[Frame],
     target: Path,
     sources: Sequence[Path],
-    metadata: list[Metadata],
-    *,
-    overwrite: bool,
+    sessions: dict[Path, Metadata],
 ) -> int:
     batch = list(islice(frames, BATCH))
-    about = Metadata(
-        link="files",
-        extra={"converted_from": [path.name for path in sources]},
-        master_clock=batch[0].master_clock if batch else MASTER_CLOCK,
-        wiring="",
-    )
-    about = metadata[0] if metadata and len(sources) == 1 else about
-    with SessionWriter(target, about, overwrite=overwrite) as writer:
-        while batch:
-            writer.append(batch)
-            batch = list(islice(frames, BATCH))
+    about = _merged(sources, sessions, batch[0].master_clock if batch else MASTER_CLOCK)
+    with TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as folder:
+        part = Path(folder) / target.name
+        with SessionWriter(part, about) as writer:
+            while batch:
+                writer.append(batch)
+                batch = list(islice(frames, BATCH))
+        part.replace(target)  # not before all of it is there
         return len(writer)
 
 
@@ -776,16 +944,17 @@ def _to_csv(frames: Iterator[Frame], target: Path) -> int:
     return count
 
 
-def _to_dat(frames: Iterator[Frame], output: str, *, overwrite: bool) -> int:
+def _to_dat(frames: Iterator[Frame], output: str) -> int:
     """One frame for NAME.dat; else numbered files after a prefix."""
     target = Path(output)
-    single = target.suffix.lower() == ".dat"
-    first = target if single else numbered(output, 1)
-    _check_target(first, exists_is_wrong=not overwrite)
-    if not single:
-        writer = DatWriter(output)
-        while batch := list(islice(frames, BATCH)):
-            writer.append(batch)
+    if target.suffix.lower() != ".dat":
+        folder = numbered(output, 1).parent
+        with TemporaryDirectory(prefix=".", dir=folder) as parts:
+            writer = DatWriter(Path(parts) / "f")
+            while batch := list(islice(frames, BATCH)):
+                writer.append(batch)
+            for number in range(1, writer.stored + 1):  # not before all of them are there
+                numbered(writer.prefix, number).replace(numbered(output, number))
         return writer.stored
     two = list(islice(frames, 2))
     if len(two) != 1:

@@ -1,8 +1,8 @@
 r"""`.dat` files, as the original host program writes them: four lines of comment, 3694 of values.
 
 Written exactly so (line ends ``\n``, ``mys`` for microseconds); read as they are found in the
-wild: with ``\r\n``, ``us``, any run of blanks, empty lines, and from boards whose master clock
-is not 4 MHz. Such a file holds the elements, the two periods and, by way of the integration time,
+wild: with ``\r\n``, ``us``, any run of blanks, empty lines, DOS's mark of a file's end (0x1A), and
+from boards whose master clock is not 4 MHz. Such a file holds the elements, the two periods and, by way of the integration time,
 the master clock; it knows no time, no LEDs and no sequence number.
 """
 
@@ -161,25 +161,25 @@ def read_dat(path: str | Path) -> Frame:
     path = Path(path)
     with path.open("rb") as file:
         data = file.read(_SIZE_LIMIT + 1)
-    if not data.strip():
+    if not data.strip(b" \t\r\n\v\f\x1a"):
         raise DatError(path, None, f"the file is empty; expected {ELEMENTS} lines 'n value'")
     if len(data) > _SIZE_LIMIT:
         raise DatError(
             path, None, f"longer than {_SIZE_LIMIT >> 20} MB; expected about 40 kB, one frame"
         )
-    text = data.removeprefix(b"\xef\xbb\xbf").decode("latin-1")
+    text = data.removeprefix(b"\xef\xbb\xbf").decode("latin-1").rstrip("\x1a")
     settings: tuple[int, int, int] | None = None
     values: list[int] = []
     number = 0
     for number, line in enumerate(_LINE_END.split(text), start=1):
         if match := _VALUE.fullmatch(line):
             values.append(_value(path, number, line, len(values) + 1, match))
-        elif line.startswith("#"):
-            if _SETTINGS_START.match(line):
+        elif (comment := line.lstrip(" \t")).startswith("#"):
+            if _SETTINGS_START.match(comment):
                 if settings is not None:
                     message = f"a second {_shown(line)}; expected one frame a file"
                     raise DatError(path, number, message)
-                settings = _settings(path, number, line)
+                settings = _settings(path, number, comment)
         elif line.strip(" \t"):
             raise DatError(path, number, f"found {_shown(line)}, expected {_wanted(values)}")
     if len(values) < ELEMENTS:

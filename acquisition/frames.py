@@ -54,7 +54,7 @@ class FrameFlags(IntFlag):
     INVALID = 1 << 8
     """The frame contradicts itself: `Frame.invalid` says how. Do not measure on it."""
     LOST = 1 << 9
-    """Frames before this one came damaged or not at all."""
+    """Frames before this one came damaged or not at all. Without LEDs, those may be unknown."""
 
 
 @dataclass(frozen=True, eq=False)

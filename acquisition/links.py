@@ -9,12 +9,11 @@ from __future__ import annotations
 import importlib
 import logging
 import re
-import struct
 import threading
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Final, Protocol, Self, runtime_checkable
+from typing import TYPE_CHECKING, Any, Final, Protocol, Self, runtime_checkable
 
 from acquisition.frames import MASTER_CLOCK, Frame, FrameFlags
 from acquisition.protocol import (
@@ -33,7 +32,7 @@ from acquisition.protocol import (
 from acquisition.wiring import PROTOCOL
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator, Mapping
     from types import TracebackType
 
 GROUP: Final = "linetrack.links"
@@ -46,9 +45,6 @@ READY_PIN: Final = 18
 _SPI_CLOCK_MAX: Final = PROTOCOL.spi_clock_max
 _BUFSIZ: Final = Path("/sys/module/spidev/parameters/bufsiz")
 _POLL: Final = 1e-4  # s
-_TRANSCRIPT: Final = b"linetrack link 1\n"
-_RECORD: Final = struct.Struct("<BqII")  # kind, monotonic ns, bytes of tx, bytes of rx
-_SILENT, _READY, _TRANSFER = range(3)
 
 _log = logging.getLogger(__name__)
 
@@ -75,7 +71,9 @@ class Link(Protocol):
 
     A link may also have ``sleep(seconds)``, where time is not the host's, ``master_clock`` (Hz),
     where the sensor's differs from the prototype's, and ``lens_system``, a mapping that JSON can
-    hold with at least a ``name``, where it knows the head in front of the sensor; see `pause`.
+    hold with at least a ``name``, where it knows the head in front of the sensor; see `pause`. One
+    that sends what was recorded has ``recorded``, the `Frame` last transferred (None if it was
+    none): LEDs, exposures and timestamp are taken from there.
     """
 
     def wait_ready(self, timeout: float) -> bool:
@@ -244,16 +242,26 @@ class SpiLink(_Closing):
             gpio.setwarnings(False)
             gpio.setmode(gpio.BCM)
             gpio.setup(self.ready_pin, gpio.IN, pull_up_down=gpio.PUD_DOWN)
-        except (RuntimeError, OSError, ValueError) as error:
-            raise LinkUnavailable(
-                f"GPIO {self.ready_pin} cannot be read ({error}): add yourself to its group with "
-                "'sudo usermod -aG gpio $USER' and log in again; is another program using it?"
-            ) from error
+        except Exception as error:  # rpi-lgpio's is none of Python's own
+            raise LinkUnavailable(self._unreadable(error)) from error
         try:
             gpio.add_event_detect(self.ready_pin, gpio.RISING, callback=self._risen)
         except RuntimeError as error:
             self._polling = True
             _log.info("no edge detection (%s): polling; rpi-lgpio can do it on new kernels", error)
+        except Exception as error:
+            raise LinkUnavailable(self._unreadable(error)) from error
+
+    def _unreadable(self, error: Exception) -> str:
+        if "peripheral base address" in str(error):
+            return (
+                f"RPi.GPIO does not know this Raspberry Pi ({error}), a model 5 or later: replace "
+                "it with 'pip uninstall RPi.GPIO' and 'pip install rpi-lgpio'"
+            )
+        return (
+            f"GPIO {self.ready_pin} cannot be read ({error}): add yourself to its group with "
+            "'sudo usermod -aG gpio $USER' and log in again; is another program using it?"
+        )
 
     def _risen(self, _: int) -> None:
         self._edge.set()
@@ -264,7 +272,7 @@ class SpiLink(_Closing):
         end = time.monotonic() + timeout
         while True:
             self._edge.clear()
-            if gpio.input(pin):
+            if self._level(gpio, pin):
                 return True
             left = end - time.monotonic()
             if left <= 0:
@@ -273,6 +281,12 @@ class SpiLink(_Closing):
                 time.sleep(min(_POLL, left))
             elif self._edge.wait(left):
                 return True  # the published firmware's pulse may be over by now
+
+    def _level(self, gpio: Any, pin: int) -> bool:
+        try:
+            return bool(gpio.input(pin))
+        except Exception as error:
+            raise LinkError(self._unreadable(error)) from error
 
     def _open_gpio(self) -> Any:
         if self._gpio is None:
@@ -379,6 +393,15 @@ class ReplayLink(_Closing):
         Begin again at the end; the frames are then kept in memory.
     realtime : bool, optional
         Take as long as the recording did (by its ICG period), for looking at it.
+    firmware_build : str, optional
+        Of the device recorded; it is what the answers to commands name.
+    lens_system : mapping, optional
+        Description of the lens head recorded with.
+
+    Attributes
+    ----------
+    recorded : Frame or None
+        What was transferred last, as it was recorded; None if that was no frame.
 
     Raises
     ------
@@ -387,8 +410,18 @@ class ReplayLink(_Closing):
     """
 
     def __init__(
-        self, frames: Iterable[Frame], *, loop: bool = False, realtime: bool = False
+        self,
+        frames: Iterable[Frame],
+        *,
+        loop: bool = False,
+        realtime: bool = False,
+        firmware_build: str = "replay",
+        lens_system: Mapping[str, Any] | None = None,
     ) -> None:
+        self.firmware_build = firmware_build
+        self.lens_system = dict(lens_system or {})
+        self.recorded: Frame | None = None
+        self._offered: Frame | None = None
         self._frames = _looped(frames) if loop else iter(frames)
         self._next = next(self._frames, None)
         self.master_clock = MASTER_CLOCK if self._next is None else self._next.master_clock
@@ -410,7 +443,7 @@ class ReplayLink(_Closing):
         if self._next is None:
             raise LinkEnded(f"the recording has ended after {self._number} frames")
         self.sleep(self._next.icg_period / self._next.master_clock)
-        self._answer = self._encoded(self._next)
+        self._answer, self._offered = self._encoded(self._next), self._next
         self._next = next(self._frames, None)
         self._number += 1
         self._left -= 1
@@ -439,7 +472,7 @@ class ReplayLink(_Closing):
         if len(tx) not in (ORIGINAL_SIZE, STREAM_SIZE):
             raise LinkError(f"{len(tx)} bytes: transfers have {size} in this mode")
         rx = (self._answer or b"").ljust(len(tx), b"\0")[: len(tx)]
-        self._answer = None
+        self.recorded, self._answer, self._offered = self._offered, None, None
         try:
             self._take(Command.decode(tx))
         except BadMagic:
@@ -467,7 +500,12 @@ class ReplayLink(_Closing):
     def _status(self, refusal: Refusal) -> bytes:
         frame = self._next
         sh, icg = (frame.sh_period, frame.icg_period) if frame else (0, 0)
-        return encode_status(Status(refusal, "replay", sh, icg))
+        return encode_status(Status(refusal, self.firmware_build, sh, icg))
+
+    def close(self) -> None:
+        """Close the recording; a second call does nothing."""
+        close: Callable[[], None] = getattr(self._frames, "close", lambda: None)
+        close()
 
 
 def _looped(frames: Iterable[Frame]) -> Iterator[Frame]:
@@ -476,125 +514,14 @@ def _looped(frames: Iterable[Frame]) -> Iterator[Frame]:
         yield from kept
 
 
-class RecordingLink(_Closing):
-    """Passes everything on to another link, and writes down what came of it.
-
-    The transcript replays byte for byte, faults included (``--link replay FILE``): for finding out
-    later what went wrong on a wire.
-
-    Parameters
-    ----------
-    link : Link
-        Closed with this one.
-    path : str or Path
-        Of the transcript, which is replaced.
-    """
-
-    def __init__(self, link: Link, path: str | Path) -> None:
-        self._link = link
-        self._file: BinaryIO = Path(path).open("wb")  # noqa: SIM115  (closed with the link)
-        self._file.write(_TRANSCRIPT)
-        self.master_clock: int = getattr(link, "master_clock", MASTER_CLOCK)
-
-    def wait_ready(self, timeout: float) -> bool:
-        """As the other link."""
-        ready = self._link.wait_ready(timeout)
-        self._file.write(_RECORD.pack(_READY if ready else _SILENT, time.monotonic_ns(), 0, 0))
-        return ready
-
-    def transfer(self, tx: bytes) -> bytes:
-        """As the other link."""
-        rx = self._link.transfer(tx)
-        sent = tx.rstrip(b"\0")
-        head = _RECORD.pack(_TRANSFER, time.monotonic_ns(), len(sent), len(rx))
-        self._file.write(head + sent + rx)
-        return rx
-
-    def sleep(self, seconds: float) -> None:
-        """As the other link."""
-        pause(self._link, seconds)
-
-    def close(self) -> None:
-        """Close the transcript and the other link."""
-        try:
-            self._file.close()
-        finally:
-            self._link.close()
-
-
-class TranscriptLink(_Closing):
-    """What a `RecordingLink` wrote down, once more: the answers do not depend on the commands.
-
-    Parameters
-    ----------
-    path : str or Path
-
-    Raises
-    ------
-    LinkError
-        The file is no transcript, or a transfer has another length than the recorded one.
-    LinkEnded
-        From `wait_ready` and `transfer`, at the end; also where the file was cut off.
-    """
-
-    def __init__(self, path: str | Path) -> None:
-        self._file: BinaryIO = Path(path).open("rb")  # noqa: SIM115  (closed with the link)
-        if self._file.read(len(_TRANSCRIPT)) != _TRANSCRIPT:
-            self._file.close()
-            raise LinkError(f"{path} is no transcript of a link")
-        self._waiting: tuple[int, bytes] | None = None
-
-    def _peek(self) -> tuple[int, bytes]:
-        if self._waiting is None:
-            head = self._file.read(_RECORD.size)
-            if len(head) < _RECORD.size:
-                raise LinkEnded("the transcript has ended")
-            kind, _, sent, received = _RECORD.unpack(head)
-            if kind > _TRANSFER or max(sent, received) > STREAM_SIZE:
-                raise LinkError("the transcript is damaged")
-            data = self._file.read(sent + received)
-            if len(data) < sent + received:
-                raise LinkEnded("the transcript has ended")
-            self._waiting = (kind, data[sent:])
-        return self._waiting
-
-    def wait_ready(self, timeout: float) -> bool:  # noqa: ARG002
-        """Return what was returned then."""
-        kind, _ = self._peek()
-        if kind != _TRANSFER:
-            self._waiting = None
-        return kind != _SILENT
-
-    def transfer(self, tx: bytes) -> bytes:
-        """Return what came in then."""
-        kind, data = self._peek()
-        while kind != _TRANSFER:
-            self._waiting = None
-            kind, data = self._peek()
-        self._waiting = None
-        if len(data) != len(tx):
-            raise LinkError(
-                f"the transcript has a transfer of {len(data)} bytes here, not {len(tx)}: was it "
-                "recorded in the other mode?"
-            )
-        return data
-
-    def sleep(self, seconds: float) -> None:
-        """No time passes."""
-
-    def close(self) -> None:
-        """Close the file; a second call does nothing."""
-        self._file.close()
-
-
-def open_replay(argument: str | None = None, **options: Any) -> ReplayLink | TranscriptLink:
+def open_replay(argument: str | None = None, **options: Any) -> ReplayLink:
     """Open a recording as a link.
 
     Parameters
     ----------
     argument : str
-        A session (HDF5), a `.dat` file, the prefix of numbered `.dat` files (``output`` for
-        ``output00001.dat`` and so on) or the transcript of a `RecordingLink`.
+        A session (HDF5), a `.dat` file, or the prefix of numbered `.dat` files (``output`` for
+        ``output00001.dat`` and so on).
     **options
         `loop` and `realtime` of `ReplayLink`.
 
@@ -611,21 +538,27 @@ def open_replay(argument: str | None = None, **options: Any) -> ReplayLink | Tra
         if not path.is_file() and first.is_file():
             return ReplayLink(_numbered(argument), **options)
         with path.open("rb") as file:
-            start = file.read(len(_TRANSCRIPT))
-        if start == _TRANSCRIPT:
-            return TranscriptLink(path)
-        if start.startswith(b"\x89HDF"):
-            return ReplayLink(_session(path), **options)
+            start = file.read(4)
+        if start == b"\x89HDF":
+            return _session(path, options)
         return ReplayLink(_dat([path]), **options)
     except OSError as error:
         raise LinkUnavailable(f"{argument} cannot be read: {error.strerror or error}") from error
 
 
-def _session(path: Path) -> Iterator[Frame]:
+def _session(path: Path, options: Mapping[str, Any]) -> ReplayLink:
     from acquisition.session import open_session
 
-    with open_session(path) as session:
-        yield from session
+    session = open_session(path)
+    about = session.metadata
+
+    def frames() -> Iterator[Frame]:
+        with session:
+            yield from session
+
+    return ReplayLink(
+        frames(), firmware_build=about.firmware_build, lens_system=about.lens_system, **options
+    )
 
 
 def _numbered(prefix: str) -> Iterator[Frame]:

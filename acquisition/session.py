@@ -96,6 +96,7 @@ _SUPERBLOCK: Final = struct.Struct("<8sBBBBQQQQI")
 _OPENED: Final = 0b101  # flags: for writing, for SWMR writing
 _ATTEMPTS: Final = 10  # to read what is being written
 _PAUSE: Final = 0.005  # s between them
+_ROOM: Final = 1 << 16  # bytes of disk; more than HDF5's own tables grow by with one batch
 
 
 class SessionError(Exception):
@@ -174,19 +175,22 @@ class SessionWriter:
     ) -> None:
         self.path = Path(path)
         self._count = 0
-        hdf5 = _h5py()
+        hdf5 = require_h5py()
         if not overwrite and self.path.exists():
             raise SessionError(f"{path} exists; choose another name, or ask to overwrite it")
         part = self.path.with_name(f".{self.path.name}.{os.getpid()}.part")
         # Under its own name the file shows up once all of it is there, open for readers.
         with _converted(self.path, "cannot be written"):
-            self._file = hdf5.File(part, "w", libver="latest")
+            self._file: Any = None
+            self._reserved = 0
             try:
+                self._file = hdf5.File(part, "w", libver="latest")
                 self._make(metadata if metadata is not None else Metadata())
                 self._file.swmr_mode = True
                 _publish(part, self.path, overwrite=overwrite)
             except BaseException:
-                self._file.close()
+                if self._file is not None:
+                    self._file.close()
                 with suppress(OSError):
                     part.unlink()
                 raise
@@ -200,6 +204,7 @@ class SessionWriter:
         }
         for name, value in asdict(metadata).items():
             attributes[name] = json.dumps(value) if name in _JSON_FIELDS else value
+        self._reserve(2 * sum(len(str(value).encode()) for value in attributes.values()))
         _describe(self._file, attributes)
         self._elements = self._file.create_dataset(
             "elements",
@@ -233,35 +238,16 @@ class SessionWriter:
             frames = [frames]
         if not frames:
             return
+        first, last = self._count, self._count + len(frames)
         with _converted(self.path, "cannot be written"):
             arrays = stack(frames)
-        self.append_arrays(arrays)
-
-    def append_arrays(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Store frames given as arrays, as `acquisition.protocol.decode_frames` returns them.
-
-        Parameters
-        ----------
-        arrays : mapping of str to ndarray
-            Some or all entries of `acquisition.frames.stack`, each with N values; "elements" must
-            be there. Left out, the master clock is the prototype's, and what else there is, unknown.
-
-        Raises
-        ------
-        SessionError
-            As `append`.
-        """
-        with _converted(self.path, "cannot be written"):
-            elements = np.ascontiguousarray(arrays["elements"], "<u2")
-            rows = np.zeros(len(elements), ROW)
-            rows["timestamp"], rows["master_clock"] = -1, MASTER_CLOCK
+            elements = arrays.pop("elements").astype("<u2", copy=False)
+            rows = np.zeros(len(frames), ROW)
             for name, values in arrays.items():
-                if name != "elements":
-                    rows[name] = values
+                rows[name] = values
             rows["elements_crc32"], rows["row_crc32"] = checksums(rows, elements)
-            first, last = self._count, self._count + len(rows)
-            if first == last:
-                return
+            chunks, tables = len(frames) // _CHUNK + 1, len(frames) // _ROWS + 1
+            self._reserve(chunks * _CHUNK * _FRAME_BYTES + tables * _ROWS * ROW.itemsize)
             self._elements.resize(last, axis=0)
             self._elements[first:last] = elements
             self._elements.flush()
@@ -269,6 +255,13 @@ class SessionWriter:
             self._frames[first:last] = rows
             self._frames.flush()
         self._count = last
+
+    def _reserve(self, size: int) -> None:
+        """Have the disk's room before HDF5 needs it: after a write that fails, it crashes."""
+        needed = self._file.id.get_filesize() + size + _ROOM
+        if needed > self._reserved:
+            os.posix_fallocate(self._file.id.get_vfd_handle(), 0, needed)
+            self._reserved = needed
 
     def __len__(self) -> int:
         return self._count
@@ -281,8 +274,16 @@ class SessionWriter:
         SessionError
             The last of it could not be written.
         """
+        if not self._file:
+            return
         with _converted(self.path, "cannot be written"):
-            self._file.close()
+            own = os.dup(self._file.id.get_vfd_handle())
+            try:
+                self._file.close()
+                end = _SUPERBLOCK.unpack(os.pread(own, _SUPERBLOCK.size, 0))[7]
+                os.ftruncate(own, end)  # gives back what was reserved and not used
+            finally:
+                os.close(own)
 
     def __enter__(self) -> Self:
         return self
@@ -533,7 +534,8 @@ class Session:
     path : Path
     metadata : Metadata
     state : {"closed", "being written", "cut off"}
-        "cut off": its writer ended without closing it. What it had acknowledged is there.
+        "cut off": its writer was killed, or could not write any more. What it had acknowledged is
+        there.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -556,7 +558,7 @@ class Session:
     def _open_once(self) -> None:
         raw = _Snapshot(self.path)  # OSError if it cannot be read
         try:
-            hdf5 = _h5py()
+            hdf5 = require_h5py()
             with _converted(self.path, "no session of linetrack, or damaged"):
                 self._file = hdf5.File(raw if raw.unfinished else self.path, "r")
         except BaseException:
@@ -603,7 +605,7 @@ class Session:
         return Metadata(**values), json.loads(writer) if isinstance(writer, str) else None
 
     def _dataset(self, name: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Any:
-        hdf5 = _h5py()
+        hdf5 = require_h5py()
         plain = isinstance(self._file.get(name, getlink=True), hdf5.HardLink)
         dataset = self._file[name] if plain else None
         # nothing that would make HDF5 open other files, or run a filter
@@ -622,10 +624,12 @@ class Session:
         """How many frames are complete."""
         count = int(min(self._frames.shape[0], self._elements.shape[0]))
         possible = size // _FRAME_BYTES
-        if self.state == "closed":
-            if self._frames.shape != self._elements.shape[:1] or count > possible:
-                raise SessionError(f"{self.path}: damaged, its two tables do not fit each other")
+        if self.state == "closed" and self._frames.shape == self._elements.shape[:1]:
+            if count > possible:
+                raise SessionError(f"{self.path}: damaged, its tables are longer than the file")
             return count
+        if self.state == "closed":  # after a write that failed
+            self.state = "cut off"
         # Of frames that were not acknowledged any part may be there: leave them out.
         count = min(count, possible)
         while count and not self._complete(count - 1):
@@ -802,7 +806,14 @@ def open_session(path: str | Path) -> Session:
     return Session(path)
 
 
-def _h5py() -> Any:
+def require_h5py() -> Any:
+    """Return the module h5py.
+
+    Raises
+    ------
+    SessionError
+        It is not installed.
+    """
     try:
         return importlib.import_module("h5py")
     except ImportError as error:
@@ -819,7 +830,8 @@ def _converted(path: Path, message: str) -> Iterator[None]:
     except SessionError:
         raise
     except Exception as error:
-        text = str(error).strip().partition("\n")[0] or type(error).__name__
+        text = getattr(error, "strerror", None) or str(error)
+        text = text.strip().partition("\n")[0] or type(error).__name__
         raise SessionError(f"{path}: {message} ({text})") from error
 
 

@@ -200,7 +200,8 @@ class FakeMcu:
         if self.mode is Mode.ORIGINAL:
             self.buffer = encode_elements(frame)
             self.offered = self.buffer
-            self.offered_until = self.now + period
+            if self.extra:  # the published firmware's handshake is a pulse
+                self.offered_until = self.now + period
             return
         if self.offered is not None:
             # the newest wins; what is lost with the older one must not be forgotten

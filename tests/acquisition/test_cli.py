@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
 SPIKES = (2400, 1250)
 PLUGIN = """
-import itertools
+import time
 from pathlib import Path
 from acquisition.links import ReplayLink
 from acquisition.session import open_session
@@ -42,6 +43,35 @@ def greet(name: str) -> None:
 def fail() -> None:
     raise RuntimeError("oops")
 
+class Silent:
+    def wait_ready(self, timeout):
+        Path("waiting").touch()
+        time.sleep(timeout)
+        return False
+
+    def transfer(self, tx):
+        return bytes(len(tx))
+
+    def close(self):
+        pass
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+class Stuck(Silent):
+    def wait_ready(self, timeout):
+        Path("waiting").touch()
+        time.sleep(1000)
+
+def silent(argument, **options):
+    return Silent()
+
+def stuck(argument, **options):
+    return Stuck()
+
 def endless(argument, **options):
     frames = list(open_session(argument))
     return ReplayLink(frames, loop=True, realtime=True)
@@ -50,6 +80,8 @@ ENTRY_POINTS = """
 [linetrack.links]
 replay = acquisition.links:open_replay
 endless = linetrack_plugin:endless
+silent = linetrack_plugin:silent
+stuck = linetrack_plugin:stuck
 [linetrack.commands]
 greet = linetrack_plugin:greet
 fail = linetrack_plugin:fail
@@ -167,7 +199,7 @@ def test_stream_into_a_session(run: Callable[..., Result], tmp_path: Path) -> No
             assert stored.exposures == sent.exposures
             assert stored.utc_ns
         about = session.metadata
-    assert about.firmware_build == "replay"
+    assert about.firmware_build == "f1"  # as recorded
     assert about.link == "replay run.h5"
     assert about.command["sequence"] == [{"0": 100}, {"1": 100}]
     assert about.command["icg_period"] == 14800  # the shortest with -s 100
@@ -238,10 +270,16 @@ def test_an_empty_recording_is_a_failure(run: Callable[..., Result]) -> None:
         ("capture -o run.h5", 2, "-o run.h5: exists; take another name, or --overwrite"),
         ("capture --head run.h5", 2, "--head run.h5: neither TOML nor JSON"),
         ("capture --head none.toml", 1, "none.toml: No such file"),
-        ("capture --link nowhere", 1, "there is no link 'nowhere'; available: .*replay"),
+        ("capture --link nowhere", 2, "there is no link 'nowhere'; available: .*replay"),
         ("capture --link replay", 1, "needs a recording: --link replay FILE"),
         ("capture --link replay none.h5", 1, "none.h5 cannot be read"),
         ("capture --link replay run.h5", 1, "recorded with -s 100 -i 14800; give the same"),
+        ("capture -o none/", 2, "-o none/00001.dat: there is no folder none"),
+        ("capture -o out.dat", 2, "would be out.dat00001.dat .* give the prefix alone: out"),
+        ("capture --stream -o site.h5", 2, "-o site.h5: is a folder"),
+        ("capture --firmware old", 2, "--firmware old: allowed are linetrack and original"),
+        ("capture --firmware original --stream", 2, "knows no --stream"),
+        ("plot run.h5 --frames 3:1", 2, "3:1 ends before it begins"),
         ("plot none.dat", 1, "none.dat: No such file"),
         ("plot run.h5 --frames 61", 2, "run.h5 has frames 1 to 60"),
         ("plot run.h5 --frames x", 2, "'x' is no number and no range"),
@@ -260,9 +298,11 @@ def test_an_empty_recording_is_a_failure(run: Callable[..., Result]) -> None:
 def test_errors_say_what_to_do(
     line: str, code: int, message: str, run: Callable[..., Result]
 ) -> None:
+    Path("site.h5").mkdir()
     result = run(*line.split())
     assert result.code == code, result
     assert re.search(message, result.err), result.err
+    assert not list(Path().glob("*.dat"))
     assert "Traceback" not in result.err
     if result.err.startswith("linetrack: "):
         assert result.err.count("\n") == 1
@@ -288,11 +328,93 @@ def test_ctrl_c_keeps_what_was_captured(count: list[str], code: int) -> None:
     assert "Traceback" not in err
     with open_session("out.h5") as session:
         assert session.state == "closed"
-        assert f"out.h5: {len(session)} frames" in err
+        asked = " of 60000 read-outs" if count else " frames"
+        assert f"out.h5: {len(session)}{asked}" in err
         if count:
             assert f"ended with Ctrl-C; {len(session)} of 60000 frames are kept" in err
         for number, some in enumerate(session):
             assert np.array_equal(some.elements, FRAMES[number % 60].elements)
+
+
+@pytest.mark.parametrize(("link", "presses"), [("silent", [0.0]), ("stuck", [0.0, 1.3, 0.3])])
+@pytest.mark.usefixtures("run")
+def test_ctrl_c_ends_a_long_wait(link: str, presses: list[float]) -> None:
+    """A link that looks up now and then ends with the first one, one that hangs with the others."""
+    arguments = ["capture", "--link", link, "-i", "4000000", "-o", "out"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "acquisition", *arguments], stderr=subprocess.PIPE, text=True
+    ) as process:
+        wait_for(Path("waiting").exists)
+        begun = time.monotonic()
+        for pause in presses:
+            time.sleep(pause)
+            process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=20)
+    assert time.monotonic() - begun < sum(presses) + 2
+    assert process.returncode == cli.INTERRUPTED, err
+    assert "ended with Ctrl-C; 0 of 2 frames are kept" in err
+    assert "Traceback" not in err
+
+
+def test_what_is_missing_is_counted(run: Callable[..., Result]) -> None:
+    gaps = [FRAMES[0], FRAMES[1], replace(FRAMES[5], flags=FrameFlags.LOST)]
+    with SessionWriter("gaps.h5") as writer:
+        writer.append([*gaps, replace(FRAMES[8], flags=FrameFlags.DROPPED)])
+    result = run(*words("capture --link replay gaps.h5 --stream -n 9 -o out.h5"))
+    assert result.code == cli.DOUBTFUL
+    assert re.search(r"out.h5: 4 of 9 read-outs, \S+/s, 2 dropped, 3 lost, 0 damaged", result.err)
+    assert "were asked for" not in result.err
+
+
+def test_the_first_of_two_limits_counts(run: Callable[..., Result]) -> None:
+    result = run(*words("capture --link replay run.h5 --stream -n 1000 --seconds 0.05 -o a.h5"))
+    assert result.code == 0
+    assert "a.h5: 14 frames" in result.err
+    result = run(*words("capture --link replay run.h5 --stream --seconds 1e-9 -o b.h5"))
+    assert result.code == 0
+    assert "b.h5: 1 frame," in result.err
+
+
+def test_older_files_are_told(run: Callable[..., Result]) -> None:
+    line = words("capture --link replay run.h5 -i 14800 -o out -n")
+    assert "older files" not in run(*line, "5").err
+    assert "older files" not in run(*line, "5").err
+    assert "older files remain, up to out00005.dat: a replay" in run(*line, "2").err
+    assert Path("out00003.dat").exists()
+
+
+def test_a_folder_that_may_not_be_written_to(
+    run: Callable[..., Result], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "access", lambda *_: False)  # root may write anywhere
+    result = run(*words("capture --link replay run.h5 -o out"))
+    assert result.code == cli.USAGE
+    assert "the folder . may not be written to" in result.err
+
+
+def test_no_name_is_refused(run: Callable[..., Result]) -> None:
+    result = run(*words("capture --link replay run.h5 -o"), "")
+    assert result.code == cli.USAGE
+    assert "a name is needed" in result.err
+
+
+def test_h5py_is_asked_for_before_the_capture(
+    run: Callable[..., Result], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    result = run(*words("capture --link nowhere --stream -o out.h5"))
+    assert result.code == cli.FAILED
+    assert "pip install 'linetrack[capture]'" in result.err
+
+
+def test_without_typer_the_command_says_so() -> None:
+    code = "import sys; sys.modules['typer'] = None; from acquisition.cli import main; main()"
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
+    assert result.returncode == cli.FAILED
+    expected = "linetrack: the command line needs typer: pip install 'linetrack[capture]'\n"
+    assert result.stderr == expected
 
 
 def stored() -> int:
@@ -313,7 +435,7 @@ def wait_for(condition: Callable[[], bool], seconds: float = 20) -> None:
 def test_plot_saves_all_files_in_one_chart(run: Callable[..., Result]) -> None:
     run(*words("capture -i 14800 -n 2 -o output --link replay run.h5"))
     result = run(*words("plot output00001.dat output00002.dat run.h5 --save chart.png"))
-    assert result == Result(0, "", "")
+    assert result == Result(0, "", "wrote chart.png\n")
     with Image.open("chart.png") as image:
         assert image.size == (900, 450)
         colours = {colour for _, colour in image.convert("RGB").getcolors(1 << 20) or []}
@@ -329,9 +451,9 @@ def test_plot_saves_all_files_in_one_chart(run: Callable[..., Result]) -> None:
 def test_live_shows_a_chart_for_each_led(run: Callable[..., Result]) -> None:
     result = run(*words("live --link replay run.h5 --frames 30"))
     assert result.code == 0
-    for text in ("LED 0  lowest", f"at pixel {SPIKES[0]}", "LED 1  lowest", f"pixel {SPIKES[1]}"):
+    for text in (f"LED 0  spike at {SPIKES[0]}.", f"LED 1  spike at {SPIKES[1]}."):
         assert text in result.out
-    assert "30 frames, 270.3/s, 0 lost" in result.out
+    assert "30 frames, 270.3/s\n" in result.out
     # in each chart the spike is the only thing that reaches down, at its place
     rows = [line[6:] for line in result.out.splitlines() if any(c > "⠀" for c in line[6:])]
     assert all(len(row) <= 104 for row in rows)
@@ -348,19 +470,18 @@ def test_live_ends_with_q() -> None:
         os.close(slave)
         seen = b""
         end = time.monotonic() + 20
-        while b"pixel 2400" not in seen and time.monotonic() < end:
+        while b"spike at 2400" not in seen and time.monotonic() < end:
             if select.select([master], [], [], 0.1)[0]:
                 seen += os.read(master, 65536)
         os.write(master, b"q")
-        while process.poll() is None and time.monotonic() < end:
-            if select.select([master], [], [], 0.1)[0]:
-                try:
+        with suppress(OSError):  # once the other end is closed
+            while time.monotonic() < end:
+                if select.select([master], [], [], 0.1)[0]:
                     seen += os.read(master, 65536)
-                except OSError:
-                    break
         assert process.wait(timeout=20) == 0
     os.close(master)
     assert b"q or Ctrl-C ends" in seen
+    assert b"q or Ctrl-C ends" not in seen[seen.rindex(b" frame") :]
     assert b"Traceback" not in seen
 
 
@@ -459,6 +580,73 @@ def test_convert_leaves_no_half_file(run: Callable[..., Result]) -> None:
     assert result.code == cli.FAILED
     assert re.search(r"a\.csv, line \d+: found \d+ columns, expected 3704", result.err)
     assert not Path("b.csv").exists()
+
+
+def test_a_broken_input_costs_no_older_file(run: Callable[..., Result]) -> None:
+    run("convert", "run.h5", "f")
+    run("convert", "run.h5", "good.h5")
+    before = {path.name: path.read_bytes() for path in Path().iterdir() if path.is_file()}
+    Path("broken.dat").write_text("#")
+    names = [*(f"f{n:05d}.dat" for n in range(1, 61)), *["run.h5", "broken.dat"]]
+    for target in ("good.h5", "new.h5", "f", "g", "new.csv"):
+        assert run("convert", *names, target, "--overwrite").code == cli.FAILED
+    Path("broken.dat").unlink()
+    assert {path.name: path.read_bytes() for path in Path().iterdir()} == before
+
+
+def test_convert_looks_at_every_number(run: Callable[..., Result]) -> None:
+    Path("keep00002.dat").write_text("precious")
+    result = run("convert", "run.h5", "keep")
+    assert result.code == cli.USAGE
+    assert "keep00002.dat: exists; take another name, or --overwrite" in result.err
+    assert [path.name for path in Path().glob("keep*")] == ["keep00002.dat"]
+
+
+def test_many_sessions_into_one_keep_what_they_said(run: Callable[..., Result]) -> None:
+    head = {"name": "f60 pair"}
+    with SessionWriter("b.h5", Metadata(link="b", firmware_build="f1", lens_system=head)) as writer:
+        writer.append(FRAMES[:2])
+    assert run("convert", "run.h5", "b.h5", "all.h5").code == 0
+    with open_session("all.h5") as session:
+        about = session.metadata
+    assert about.firmware_build == "f1"
+    assert about.lens_system == {}  # they differ
+    assert "[pins]" in about.wiring
+    assert [one["file"] for one in about.extra["sessions"]] == ["run.h5", "b.h5"]
+    assert about.extra["sessions"][1]["lens_system"] == head
+
+
+def test_frames_are_of_sessions(run: Callable[..., Result]) -> None:
+    run("convert", "run.h5", "f")
+    result = run("plot", "f00001.dat", "--frames", "1", "--save", "a.png")
+    assert result.code == cli.USAGE
+    assert "only sessions have more" in result.err
+
+
+@pytest.mark.parametrize(("first", "last"), [(0, 9), (1000, 1195), (3638, 3647)])
+def test_a_spike_is_measured(first: int, last: int) -> None:
+    values = np.full(3648, 3900, np.uint16)
+    values[::2] += 3
+    assert charts.spike(values) is None
+    values[first : last + 1] -= np.uint16(1000)
+    found = charts.spike(values)
+    assert found is not None
+    centre, width, depth = found
+    assert abs(centre - (first + last) / 2) < 0.1
+    assert width == last - first + 1
+    assert abs(depth - 1000) <= 3
+
+
+@pytest.mark.usefixtures("plugins")
+def test_help_fits_80_columns(run: Callable[..., Result], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    lines = [line.strip() for line in run("--help").out.splitlines()]
+    for text in (
+        "linetrack capture -i 30000 -s 100 -n 2 -o output",
+        "two frames, as .dat files",
+        "3 done, but some frames are invalid, damaged or lost",
+    ):
+        assert text in lines
 
 
 # --- help and plug-ins

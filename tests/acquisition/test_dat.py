@@ -50,6 +50,9 @@ def test_written_as_the_original_does(tmp_path: Path) -> None:
         pytest.param(lambda text: text.rstrip("\n"), id="no-last-line-end"),
         pytest.param(lambda text: "\ufeff" + text, id="byte-order-mark"),
         pytest.param(lambda text: "\n".join(text.split("\n")[3:]), id="settings-only"),
+        pytest.param(lambda text: text + "\x1a", id="dos-end"),
+        pytest.param(lambda text: text.rstrip("\n") + "\x1a\x1a", id="dos-end-of-line"),
+        pytest.param(lambda text: text.replace("#", " \t#"), id="indented-comments"),
     ],
 )  # fmt: skip
 def test_read_as_found_in_the_wild(change: object, tmp_path: Path) -> None:
@@ -106,6 +109,8 @@ def test_any_frame_comes_back(
     [
         ("", "the file is empty; expected 3694 lines"),
         (" \r\n\n", "the file is empty"),
+        ("\x1a", "the file is empty"),
+        (TEXT.replace("\n7 6\n", "\n7 6\x1a\n"), r"line 11: found '7 6\x1a'"),
         (TEXT.replace("\n7 6\n", "\n"), "line 11: found value number 8, expected number 7"),
         (TEXT.replace("\n7 6\n", "\n7 6\n7 6\n"), "line 12: found value number 7, expected number 8"),
         (TEXT.replace("\n7 6\n", "\n7 x\n"), "line 11: found '7 x', expected '7 value' or a comment"),

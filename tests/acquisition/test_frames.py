@@ -99,6 +99,17 @@ def test_what_a_wire_does_to_a_frame() -> None:
     assert "above the dark reference" in reasons(high.tobytes())
 
 
+@pytest.mark.parametrize("at", [16, 22, 28])
+def test_how_far_the_dark_reference_may_spread(at: int) -> None:
+    elements = np.full(ELEMENTS, 3000, np.uint16)
+    elements[0] = 2990
+    elements[at] = 3000 - 128
+    assert Frame(elements).invalid() == []
+    elements[at] -= np.uint16(1)
+    (reason,) = Frame(elements).invalid()
+    assert "spreads over 129 counts, more than 128" in reason
+
+
 @given(st.binary(min_size=40, max_size=40), st.integers(0, 100))
 def test_any_frame_can_be_judged(part: bytes, at: int) -> None:
     elements = elements_at(0).copy()

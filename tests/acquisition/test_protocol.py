@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from acquisition.frames import CHANNELS, ELEMENTS, Frame, FrameFlags, stack
+from acquisition.frames import CHANNELS, ELEMENTS, Frame, FrameFlags
 from acquisition.protocol import (
     CHAIN_FIRST,
     CHAIN_STEP,
@@ -35,7 +35,6 @@ from acquisition.protocol import (
     crc32_words,
     decode_elements,
     decode_frame,
-    decode_frames,
     encode_elements,
     encode_frame,
     encode_status,
@@ -397,36 +396,3 @@ def test_garbage_is_no_frame() -> None:
         for start in (b"", b"LT", b"LT\x01\0"):
             with pytest.raises(DecodeError):
                 decode_frame(start + data[len(start) :])
-
-
-def test_many_at_once() -> None:
-    rng = random.Random(3)  # noqa: S311
-    frames, sent, good = [], [], []
-    for n in range(60):
-        data = encode_frame(
-            Frame(FRAME.elements, sequence=n, leds=n, sh_period=50, icg_period=20000, timestamp=n)
-        )
-        if n % 7 == 3:
-            data = damaged(rng)[:STREAM_SIZE].ljust(STREAM_SIZE, b"\0")
-        elif n % 7 == 5:
-            data = encode_status(Status(Refusal.NONE, "x", 50, 20000))
-        try:
-            item = decode_frame(data)
-            good.append(isinstance(item, Frame))
-            if isinstance(item, Frame):
-                frames.append(item)
-        except DecodeError:
-            good.append(False)
-        sent.append(data)
-    wanted = stack(frames)
-    arrays, found = decode_frames(b"".join(sent))
-    assert found.tolist() == good
-    for name, values in arrays.items():
-        assert values.dtype == wanted[name].dtype, name
-        np.testing.assert_array_equal(values, wanted[name])
-    block = np.frombuffer(b"".join(sent), np.uint8).reshape(60, -1)
-    np.testing.assert_array_equal(decode_frames(block)[1], found)
-    assert decode_frames(b"")[1].size == 0
-    for bad in (b"123", np.zeros((3, 7388), np.uint8), np.zeros((1, 7424), np.uint16)):
-        with pytest.raises(ShortFrame):
-            decode_frames(bad)  # type: ignore[arg-type]

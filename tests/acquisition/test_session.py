@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -124,13 +125,6 @@ def test_any_frame_comes_back(tmp_path_factory: pytest.TempPathFactory, some: Fr
         writer.append(some)
     with open_session(path) as session:
         assert session[0] == some
-
-
-def test_arrays_without_frames(path: Path) -> None:
-    with SessionWriter(path) as writer:
-        writer.append_arrays({"elements": stack(FRAMES[:3])["elements"], "sequence": np.arange(3)})
-    with open_session(path) as session:
-        assert session[2] == Frame(FRAMES[2].elements, sequence=2)
 
 
 def test_an_existing_file_is_kept_unless_asked(path: Path) -> None:
@@ -277,16 +271,86 @@ def test_strange_tables_are_refused(path: Path, tmp_path: Path) -> None:
                 file.create_dataset(
                     "elements", data=np.zeros((4, ELEMENTS), "<u2"), compression="gzip"
                 )
-            elif change == "longer":
-                file["elements"].resize(5, axis=0)
             elif change == "endless":
                 for name in ("elements", "frames"):
                     file[name].resize(1 << 40, axis=0)
         open_session(path).close()
 
-    for change in ("external link", "group", "dtype", "filter", "longer", "endless"):
-        with pytest.raises(SessionError, match=r"not what a session has|do not fit"):
+    for change in ("external link", "group", "dtype", "filter", "endless"):
+        with pytest.raises(SessionError, match=r"not what a session has|longer than the file"):
             spoil_by(change)
+
+
+def test_after_a_failed_write_the_shorter_table_counts(path: Path) -> None:
+    for longer in ("elements", "frames"):
+        with SessionWriter(path, overwrite=True) as writer:
+            writer.append(FRAMES[:4])
+        with h5py.File(path, "r+") as file:
+            file[longer].resize(7, axis=0)
+        with open_session(path) as session:
+            assert session.state == "cut off"
+            assert list(session) == FRAMES[:4]
+
+
+FULL = """
+import resource, signal, sys
+from acquisition import cli
+from acquisition.dat import read_dat
+from acquisition.session import SessionWriter
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+limit = int(sys.argv.pop(1))
+resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+cli.main(sys.argv[1:])
+"""
+
+
+@pytest.mark.parametrize("limit", [0, 4000, 9000, 1 << 18, 700_000, 1 << 20])
+def test_a_full_disk_costs_no_frame_that_was_acknowledged(limit: int, tmp_path: Path) -> None:
+    source, target = tmp_path / "source.h5", tmp_path / "full.h5"
+    with SessionWriter(source) as writer:
+        writer.append(FRAMES)
+    command = f"capture --link replay {source} --stream -n 150 -o {target}"
+    run = subprocess.run(
+        [sys.executable, "-c", FULL, str(limit), *command.split()],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert run.returncode == 1, run
+    assert f"{target}: cannot be written (" in run.stderr
+    assert "File too large" in run.stderr or limit < 1 << 16
+    assert [p.name for p in tmp_path.iterdir() if p.suffix == ".part"] == []
+    stored = 0
+    if target.exists():
+        with open_session(target) as session:
+            assert session.state == "closed"
+            stored = len(session)
+            for some, sent in zip(session, FRAMES, strict=False):
+                assert np.array_equal(some.elements, sent.elements)
+        assert f"full.h5: {stored} of 150 read-outs" in run.stderr or not stored
+    assert stored > 0 or limit < 1 << 20
+
+
+def test_a_finished_session_is_no_longer_than_it_must_be(path: Path) -> None:
+    with SessionWriter(path) as writer:
+        writer.append(FRAMES[0])
+    size = path.stat().st_size
+    with h5py.File(path, "r") as file:
+        assert size == file.id.get_filesize()
+    assert size < 400_000
+
+
+def test_a_writer_that_is_a_zombie_writes_no_more(path: Path) -> None:
+    """It has ended, but its parent has not asked how."""
+    code = (
+        "import os, sys; from acquisition.session import SessionWriter; "
+        "writer = SessionWriter(sys.argv[1]); os._exit(0)"
+    )
+    with subprocess.Popen([sys.executable, "-c", code, str(path)]) as process:
+        os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+        with open_session(path) as session:
+            assert session.state == "cut off"
 
 
 def test_checksums_cover_every_field() -> None:

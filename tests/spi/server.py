@@ -94,7 +94,7 @@ class SpiServer:
         return self.device.transfer(read(number))
 
     def run(
-        self, shim: Path, code: str, *, bufsiz: int | None = None
+        self, shim: Path, code: str, *, bufsiz: int | None = None, edges: bool = False
     ) -> subprocess.CompletedProcess[str]:
         """Run Python code with the shim and the GPIO stand-in; returns what it printed."""
         environment = {
@@ -105,6 +105,8 @@ class SpiServer:
         }
         if bufsiz is not None:
             environment["LINETRACK_SPI_BUFSIZ"] = str(bufsiz)
+        if edges:
+            environment["LINETRACK_SPI_EDGES"] = "1"
         return subprocess.run(  # the code is the test's own
             [sys.executable, "-W", "error", "-c", code],
             env=environment,

@@ -41,8 +41,8 @@ class Echo:
         return bytes((byte + 1) % 256 for byte in tx)
 
 
-def run(server: SpiServer, shim: Path, code: str, *, bufsiz: int | None = None) -> Any:
-    result = server.run(shim, "import json\n" + code, bufsiz=bufsiz)
+def run(server: SpiServer, shim: Path, code: str, **options: Any) -> Any:
+    result = server.run(shim, "import json\n" + code, **options)
     assert result.returncode == 0, result.stderr
     assert result.stderr == ""
     return json.loads(result.stdout)
@@ -107,18 +107,22 @@ from acquisition.capture import capture
 from acquisition.links import SpiLink
 from acquisition.protocol import Command, Mode
 with SpiLink() as link:
-    frames = list(capture(link, {command}))
+    assert link._polling is not {edges}
+    frames = list(capture(link, {command}, timeout=60))  # real time, and the device's is its own
 print(json.dumps([
     (frame.sequence, frame.leds, int(frame.flags), int(frame.elements.astype(int).sum()))
     for frame in frames
 ]))"""
 
 
+@pytest.mark.parametrize("edges", [False, True])
 @pytest.mark.parametrize(
     "command",
     ["Command(100, 30000, 2)", "Command(100, 30000, 4, Mode.STREAM, [{0: 90}, {1: 80}])"],
 )
-def test_the_same_frames_as_without_spidev(shim: Path, tmp_path: Path, command: str) -> None:
+def test_the_same_frames_as_without_spidev(
+    shim: Path, tmp_path: Path, command: str, edges: bool
+) -> None:
     asked = eval(command, {"Command": Command, "Mode": Mode})  # noqa: S307
     wanted = [
         [frame.sequence, frame.leds, int(frame.flags), int(frame.elements.astype(int).sum())]
@@ -126,7 +130,8 @@ def test_the_same_frames_as_without_spidev(shim: Path, tmp_path: Path, command: 
     ]
     device = FakeMcu()
     with SpiServer(device, tmp_path) as server:
-        assert run(server, shim, CAPTURE.format(command=command)) == wanted
+        code = CAPTURE.format(command=command, edges=edges)
+        assert run(server, shim, code, edges=edges) == wanted
     assert set(server.sizes) <= {4096, 3292, 3328}
     assert server.settings == {(0, 15600000, 8)}
 
@@ -148,16 +153,18 @@ except FileNotFoundError:
         assert server.sizes == []
 
 
+@pytest.mark.parametrize("edges", [False, True])
 @pytest.mark.parametrize(
     "command", ["Command(100, 30000, 2)", "Command(100, 20000, 5, Mode.STREAM)"]
 )
-def test_the_twin_through_spidev(shim: Path, tmp_path: Path, command: str) -> None:
+def test_the_twin_through_spidev(shim: Path, tmp_path: Path, command: str, edges: bool) -> None:
     if not os.environ.get("CI"):
         pytest.importorskip("unicorn")
     from twin.link import TwinLink
 
     with TwinLink() as twin, SpiServer(twin, tmp_path) as server:
-        found = run(server, shim, CAPTURE.format(command=command))
+        code = CAPTURE.format(command=command, edges=edges)
+        found = run(server, shim, code, edges=edges)
     asked = eval(command, {"Command": Command, "Mode": Mode})  # noqa: S307
     with TwinLink() as twin:
         wanted = [

@@ -36,6 +36,7 @@ class FaultyLink(TwinLink):
         self.rng = np.random.Generator(np.random.PCG64(seed))
         self.readouts: dict[bytes, tuple[float, int]] = {}  # pixels: time of transfer, LEDs
         self.fault: str | None = None
+        self.after = 0  # transfers that are still left alone
         self.over = 0.0  # virtual time at which the last fault was over
         self.struck: Counter[str] = Counter()
         super().__init__(**options)
@@ -57,9 +58,9 @@ class FaultyLink(TwinLink):
 
         self.sensor.digitise = remembered  # type: ignore[method-assign]
 
-    def strike(self, fault: str) -> None:
-        """Let the next transfer, or look at the handshake, go wrong."""
-        self.fault = fault
+    def strike(self, fault: str, after: int = 0) -> None:
+        """Let the next transfer but `after`, or the next look at the handshake, go wrong."""
+        self.fault, self.after = fault, after
 
     def wait_ready(self, timeout: float) -> bool:
         """As the handshake line looks from the host."""
@@ -77,6 +78,9 @@ class FaultyLink(TwinLink):
     def transfer(self, tx: bytes) -> bytes:
         """As the bytes arrive at the other end."""
         if self.fault is None or not hasattr(self, "_" + self.fault.replace(" ", "_")):
+            return super().transfer(tx)
+        if self.after:
+            self.after -= 1
             return super().transfer(tx)
         inflict: Callable[[bytes], bytes] = getattr(self, "_" + self.fault.replace(" ", "_"))
         rx = inflict(tx)

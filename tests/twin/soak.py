@@ -42,7 +42,7 @@ def main() -> int:
     for kind, count in sorted(struck.items()):
         sys.stdout.write(f"{kind:18s} {count:7d} times, at most {silent[kind]:.3f} s silent\n")
     late = any(worst[kind] > 2 for kind in LINK_FAULTS)
-    late = late or any(silent.get(kind, 0.0) > 0.5 for kind in DEVICE_FAULTS)
+    late = late or any(silent.get(kind, 0.0) > 0.2 for kind in DEVICE_FAULTS)
     return int(corrupt > 0 or late)
 
 

@@ -40,7 +40,7 @@ def test_stream_survives_resets_and_garbage_commands() -> None:
     assert set(report.faults) == set(DEVICE_FAULTS)
     assert sum(report.faults.values()) >= round(CASES * SHARE)
     for kind, silent in report.silent.items():
-        assert max(silent) < 0.5, kind
+        assert max(silent) < 0.2, kind
 
 
 def test_every_fault_is_one() -> None:
@@ -74,14 +74,14 @@ def test_original_mode_reports_invalid_data_where_it_can_be_seen(kind: str) -> N
     seen = 0
     for seed in range(12):
         with FaultyLink(seed) as link:
-            frames = iter(capture(link, Command(100, 30000, 3), retries=8))
-            first = next(frames)
-            assert not first.flags & FrameFlags.INVALID
-            link.strike(kind)
-            rest = list(frames)
+            link.strike(kind, after=2)  # the command and the first frame are left alone
+            rest = list(capture(link, Command(100, 30000, 3), retries=8))
+            assert link.struck[kind] == 1
+            assert not rest[0].flags & FrameFlags.INVALID
             right = [frame.pixels.tobytes() in link.readouts for frame in rest]
             flagged = [bool(frame.flags & FrameFlags.INVALID) for frame in rest]
-            seen += any(flagged)
+            # after a reset nothing more comes: the call is begun anew, and nothing wrong delivered
+            seen += any(flagged) or (kind == "reset" and all(right))
             # odd numbers of bytes shift low and high: 16 bits where the ADC has 12
             for good, invalid, frame in zip(right, flagged, rest, strict=True):
                 if not good and not invalid:
