@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from acquisition.frames import CHANNELS
 from acquisition.links import LinkError, LinkUnavailable
 from twin.machine import CLOCK, Machine
 from twin.sensor import Electronics, SensorModel
-from twin.world import CHANNELS, World
+from twin.world import World
 
 if TYPE_CHECKING:
     from types import TracebackType

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from acquisition.frames import CHANNELS
 from raytransfer import TCD1304, OpticalSystem, prototype_head
 from raytransfer import _checks as check
 from raytransfer.illumination import pixel_solid_angles
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
 PLANCK = 6.62607015e-34  # J s
 SPEED_OF_LIGHT = 299792458.0  # m/s
 LUMINOUS_EFFICACY = 683.0  # lm/W at 555 nm
-CHANNELS = 64
-"""LED channels that the firmware can switch."""
 
 
 @dataclass(frozen=True)
