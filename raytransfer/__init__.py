@@ -10,13 +10,14 @@ from __future__ import annotations
 from typing import Any
 
 from raytransfer.casting import cast_rays, cast_rays_to_focal_length
-from raytransfer.lenses import CATALOGUE, THESIS_LENSES, Lens, Plate
+from raytransfer.lenses import CATALOGUE, THESIS_LENSES, Aperture, Lens, Plate, SphericalLens
 from raytransfer.materials import MATERIALS, ConstantIndex, Sellmeier
 from raytransfer.matrices import RayMatrix, flat_mat, input_vec, refract_mat, trans_mat
 from raytransfer.sensors import SENSORS, TCD1304, LineSensor
 from raytransfer.systems import (
     CardinalPoints,
     OpticalSystem,
+    Placement,
     collimating_pair,
     prototype_head,
     telecentric_pair,
@@ -30,14 +31,17 @@ __all__ = [
     "SENSORS",
     "TCD1304",
     "THESIS_LENSES",
+    "Aperture",
     "CardinalPoints",
     "ConstantIndex",
     "Lens",
     "LineSensor",
     "OpticalSystem",
+    "Placement",
     "Plate",
     "RayMatrix",
     "Sellmeier",
+    "SphericalLens",
     "cast_rays",
     "cast_rays_to_focal_length",
     "collimating_pair",

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from raytransfer import _checks as check
-from raytransfer.lenses import Lens, Meridian
 from raytransfer.sensors import TCD1304, LineSensor
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from raytransfer.lenses import Meridian
     from raytransfer.systems import OpticalSystem
 
 
@@ -75,10 +75,7 @@ def footprint(
     at_0 = path[:, 0, 0]
     slope = path[:, 0, 1] - at_0
     low, high = -np.inf, np.inf
-    half = [
-        element.size(meridian) / 2 if isinstance(element, Lens) else np.inf
-        for element in system.elements
-    ]
+    half = [element.aperture(meridian) / 2 for element in system.elements]
     for height, rise, limit in zip(at_0, slope, np.repeat(half, 2), strict=True):
         if rise == 0:
             if abs(height) > limit:

@@ -1,4 +1,4 @@
-"""Plano-cylindrical lenses and plane plates, and the catalogue they are bought from.
+"""Lenses, plates and screens, and the catalogue of plano-cylindrical lenses.
 
 `CATALOGUE` maps part numbers to lenses as the maker lists them, `THESIS_LENSES` the thesis's names
 to the rounded values of its listings. Both are read from ``data/lenses.toml``.
@@ -15,6 +15,7 @@ from raytransfer import _checks as check
 from raytransfer._data import FOLDER, read
 from raytransfer.materials import D_LINE, MATERIALS, Material
 from raytransfer.matrices import RayMatrix, flat_mat, refract_mat, trans_mat
+from raytransfer.surfaces import Surface
 
 Meridian = Literal["x", "y"]
 """The plane of a paraxial ray: x holds the sensor's pixel line, y is across it."""
@@ -64,6 +65,168 @@ class Plate:
         check_meridian("meridian", meridian)
         return _plate(self.thickness, self.material.index(wavelength) if plates else None)
 
+    def size(self, meridian: Meridian) -> float:
+        """Size in one meridian: no edge is known."""
+        check_meridian("meridian", meridian)
+        return math.inf
+
+    aperture = size
+
+    def surfaces(self) -> tuple[Surface, ...]:
+        """Front and back."""
+        return Surface(material=self.material), Surface(z=self.thickness)
+
+    def turned(self) -> Self:
+        """Return the plate: both sides are alike."""
+        return self
+
+
+@dataclass(frozen=True)
+class Aperture:
+    """A thin opaque screen with a rectangular opening, such as a slit.
+
+    Parameters
+    ----------
+    part : str
+        Name.
+    x, y : float
+        Full widths of the opening, mm, > 0; infinite where it has no edge.
+    """
+
+    part: str
+    x: float = math.inf
+    y: float = math.inf
+
+    def __post_init__(self) -> None:
+        for name in ("x", "y"):
+            if getattr(self, name) != math.inf:
+                check.positive(f"{name} of {self.part}", getattr(self, name), "a full width in mm")
+
+    @property
+    def thickness(self) -> float:
+        """Of the screen: 0."""
+        return 0.0
+
+    def matrix(
+        self, meridian: Meridian, *, plates: bool = True, wavelength: float = D_LINE
+    ) -> RayMatrix:
+        """Matrix in either meridian: it bends nothing."""
+        del plates, wavelength  # as the other elements have it
+        check_meridian("meridian", meridian)
+        return _plate(0.0, None)
+
+    def size(self, meridian: Meridian) -> float:
+        """Size of the screen: it has no edge."""
+        check_meridian("meridian", meridian)
+        return math.inf
+
+    def aperture(self, meridian: Meridian) -> float:
+        """Full opening in one meridian, mm."""
+        check_meridian("meridian", meridian)
+        return self.x if meridian == "x" else self.y
+
+    def surfaces(self) -> tuple[Surface, ...]:
+        """The screen."""
+        return (Surface(half=(self.x / 2, self.y / 2), screen=True),)
+
+    def turned(self) -> Self:
+        """Return the screen: both sides are alike."""
+        return self
+
+
+@dataclass(frozen=True)
+class SphericalLens:
+    """A round lens with two spherical or plane sides.
+
+    Parameters
+    ----------
+    part : str
+        Part number or name.
+    diameter : float
+        mm.
+    front_radius, back_radius : float
+        Radii of curvature in mm, > 0 where the centre of curvature lies behind the surface;
+        infinite for a plane.
+    centre_thickness : float
+        Thickness on the optical axis, mm.
+    material : Material
+
+    Raises
+    ------
+    ValueError
+        If a size is not positive, a radius is shorter than half the diameter, or the sides cross
+        before the edge.
+    """
+
+    part: str
+    diameter: float
+    front_radius: float
+    back_radius: float
+    centre_thickness: float
+    material: Material
+
+    def __post_init__(self) -> None:
+        for name in ("diameter", "centre_thickness"):
+            check.positive(f"{name} of {self.part}", getattr(self, name), "a size in mm")
+        check_material(self.part, self.material)
+        for name in ("front_radius", "back_radius"):
+            radius = getattr(self, name)
+            if math.isinf(radius):
+                continue
+            check.radius(f"{name} of {self.part}", radius)
+            if abs(radius) < self.diameter / 2:
+                raise ValueError(
+                    f"{name} of {self.part} = {radius:g} mm: |radius| is at least half the "
+                    f"diameter ({self.diameter / 2:g} mm)"
+                )
+        if self.edge_thickness < 0:
+            raise ValueError(
+                f"centre_thickness of {self.part} = {self.centre_thickness:g} mm: the sides cross "
+                f"before the edge, which would be {self.edge_thickness:.4g} mm thick"
+            )
+
+    @property
+    def thickness(self) -> float:
+        """Thickness on the optical axis, mm."""
+        return self.centre_thickness
+
+    @property
+    def edge_thickness(self) -> float:
+        """Thickness at the edge, mm."""
+        front, back = (float(side.sag(self.diameter / 2, 0.0)) for side in self.surfaces())
+        return self.centre_thickness - front + back
+
+    def size(self, meridian: Meridian) -> float:
+        """Diameter, mm."""
+        check_meridian("meridian", meridian)
+        return self.diameter
+
+    aperture = size
+
+    def turned(self) -> Self:
+        """Return the lens with its other side to the light."""
+        return replace(self, front_radius=-self.back_radius, back_radius=-self.front_radius)
+
+    def surfaces(self) -> tuple[Surface, ...]:
+        """Front and back."""
+        half = (self.diameter / 2, self.diameter / 2)
+        front = Surface(0.0, 1 / self.front_radius, "xy", half, True, self.material)
+        return front, Surface(self.thickness, 1 / self.back_radius, "xy", half, True)
+
+    def matrix(
+        self, meridian: Meridian, *, plates: bool = True, wavelength: float = D_LINE
+    ) -> RayMatrix:
+        """Matrix from the first vertex to the second, air to air: the same in both meridians."""
+        del plates  # it has none
+        check_meridian("meridian", meridian)
+        n = self.material.index(wavelength)
+        front, back = (
+            flat_mat(before, after) if math.isinf(radius) else refract_mat(before, after, radius)
+            for before, after, radius in ((1.0, n, self.front_radius), (n, 1.0, self.back_radius))
+        )
+        matrix: RayMatrix = back @ trans_mat(self.thickness) @ front
+        return matrix
+
 
 @dataclass(frozen=True)
 class Lens:
@@ -84,12 +247,15 @@ class Lens:
         The meridian in which the lens has power.
     reversed : bool
         False: the curved side meets the light first. True: the plane side does.
+    clear : tuple of float, optional
+        Clear aperture across and along the axis of the cylinder, mm, where a mount covers the
+        edges; left out, all of the glass.
 
     Raises
     ------
     ValueError
-        If a size is not positive, the radius is shorter than half the height, or a convex lens is
-        too thin for its edge to exist.
+        If a size is not positive, the radius is shorter than half the height, a convex lens is
+        too thin for its edge to exist, or the clear aperture is larger than the glass.
     """
 
     part: str
@@ -100,6 +266,7 @@ class Lens:
     material: Material
     bends: Meridian = "x"
     reversed: bool = False
+    clear: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         for name in ("height", "length"):
@@ -123,6 +290,16 @@ class Lens:
                 f"is {self.sag(self.height / 2):.4g} mm deep, the edge would be "
                 f"{self.edge_thickness:.4g} mm thick; was the edge thickness given?"
             )
+        if self.clear is None:
+            return
+        object.__setattr__(self, "clear", tuple(self.clear))
+        for name, clear in zip(("height", "length"), self.clear, strict=True):
+            size = getattr(self, name)
+            if check.positive(f"clear {name} of {self.part}", clear, "a size in mm") > size:
+                raise ValueError(
+                    f"clear {name} of {self.part} = {clear:g} mm: the glass is {size:g} mm; "
+                    "clear is (across, along) the axis of the cylinder"
+                )
 
     @property
     def thickness(self) -> float:
@@ -139,9 +316,24 @@ class Lens:
         return math.copysign(abs(self.radius) - math.sqrt(self.radius**2 - y**2), self.radius)
 
     def size(self, meridian: Meridian) -> float:
-        """Full aperture in one meridian, mm."""
+        """Size of the glass in one meridian, mm."""
         check_meridian("meridian", meridian)
         return self.height if meridian == self.bends else self.length
+
+    def aperture(self, meridian: Meridian) -> float:
+        """Full opening in one meridian, mm."""
+        check_meridian("meridian", meridian)
+        across, along = self.clear or (self.height, self.length)
+        return across if meridian == self.bends else along
+
+    def surfaces(self) -> tuple[Surface, ...]:
+        """Front and back."""
+        half = (self.aperture("x") / 2, self.aperture("y") / 2)
+        if self.reversed:
+            front = Surface(half=half, material=self.material)
+            return front, Surface(self.thickness, -1 / self.radius, self.bends, half)
+        front = Surface(0.0, 1 / self.radius, self.bends, half, material=self.material)
+        return front, Surface(self.thickness, half=half)
 
     def focal_length(self, wavelength: float = D_LINE) -> float:
         """Effective focal length of the lens alone, in mm: R/(n − 1)."""
@@ -176,7 +368,7 @@ class Lens:
         return matrix
 
 
-Element = Lens | Plate
+Element = Lens | SphericalLens | Plate | Aperture
 
 
 def _plate(thickness: float, n: float | None) -> RayMatrix:

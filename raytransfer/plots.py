@@ -20,7 +20,7 @@ from matplotlib.ticker import MaxNLocator
 from raytransfer import _checks as check
 from raytransfer._data import FOLDER
 from raytransfer.casting import cast_rays
-from raytransfer.lenses import Element, Lens, Meridian
+from raytransfer.lenses import Aperture, Element, Meridian, Plate
 from raytransfer.sensors import TCD1304, LineSensor
 from raytransfer.studies import FAR, NEAR, beam_width
 
@@ -227,19 +227,25 @@ def outline(placed: Placed, meridian: Meridian, window: float) -> NDArray[np.flo
     window : float
         Half size in mm of elements that are not lenses.
     """
-    element, front, back = placed
+    element, front, _ = placed
     half = _half_size(element, meridian, window)
     y = np.linspace(half, -half, 41)
-    left, right = np.full_like(y, front), np.full_like(y, back)
-    if isinstance(element, Lens) and element.bends == meridian:
-        sag = np.array([element.sag(height) for height in y])
-        left, right = (left, right - sag) if element.reversed else (left + sag, right)
-    return np.concatenate([np.stack([left, y], 1), np.stack([right, y], 1)[::-1]])
+    at = (y, 0.0) if meridian == "x" else (0.0, y)
+    left, right = (
+        np.stack([front + side.z + side.sag(*at) + 0 * y, y], 1) for side in element.surfaces()
+    )
+    return np.concatenate([left, right[::-1]])
 
 
 def _draw_glass(ax: Axes, system: OpticalSystem, meridian: Meridian, window: float) -> None:
     for placed in system.layout():
-        bends = isinstance(placed.element, Lens) and placed.element.bends == meridian
+        if isinstance(placed.element, Aperture):
+            half = placed.element.aperture(meridian) / 2
+            for side in (-1, 1):
+                end = side * max(1.5 * half, window)
+                ax.plot([placed.front] * 2, [side * half, end], color="k", linewidth=2)
+            continue
+        bends = any(meridian in side.bends for side in placed.element.surfaces())
         ax.add_patch(
             Polygon(
                 outline(placed, meridian, window),
@@ -288,7 +294,8 @@ def plot_system(
     """
     window = 0.51 * sensor.length  # a little longer than the pixels
     if width is None:
-        width = 2 * _half_size(system.elements[0], meridian, window)
+        opening = _half_opening(system.elements[0], meridian, window)
+        width = 2 * (opening if np.isfinite(opening) else window)
     end = system.sensor_distance if sensor_dist is None else sensor_dist
     behind = 20.0 if end is None else end
     lead = 0.35 * (system.length + behind)
@@ -298,7 +305,7 @@ def plot_system(
         z, path = system.trace(np.stack([y, slopes]), meridian, plates=plates)
         start, last = y - lead * slopes, path[-1]
         heights = np.vstack([start, path[:, 0], last[0] + behind * last[1]])
-        half = [_half_size(element, meridian, window) for element in system.elements]
+        half = [_half_opening(element, meridian, window) for element in system.elements]
         missed = np.abs(path[:, 0]) > np.repeat(half, 2)[:, None] + 1e-9
         gone = np.maximum.accumulate(missed)
         heights[2:][gone] = np.nan  # drawn up to the vertex where it misses
@@ -320,9 +327,13 @@ def plot_system(
 
 
 def _half_size(element: Element, meridian: Meridian, window: float) -> float:
-    if not isinstance(element, Lens):
-        return window
-    return element.size(meridian) / 2
+    half = element.size(meridian) / 2
+    return half if np.isfinite(half) else window
+
+
+def _half_opening(element: Element, meridian: Meridian, window: float) -> float:
+    half = element.aperture(meridian) / 2
+    return window if isinstance(element, Plate) else half
 
 
 def _draw_sensor(ax: Axes, z: float, half: float) -> None:

@@ -6,8 +6,9 @@ The optical frame: Z with the light, X along the sensor's pixel line, Y up. Dist
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
+from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -22,12 +23,61 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
 
+MERIDIANS: tuple[Meridian, Meridian] = ("x", "y")
+
+
 class Placed(NamedTuple):
     """An element and where its two vertices are, mm behind the system's first vertex."""
 
     element: Element
     front: float
     back: float
+
+
+@dataclass(frozen=True)
+class Placement:
+    """How an element deviates from its place on the axis.
+
+    Parameters
+    ----------
+    decentre : tuple of float
+        Along X and Y, mm.
+    tilt : tuple of float
+        About X, Y and Z through the element's front vertex, one after the other, rad, right-handed:
+        the rotation is R = Rz Ry Rx.
+    """
+
+    decentre: tuple[float, float] = (0.0, 0.0)
+    tilt: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for name, length, unit in (
+            ("decentre", 2, "mm in X and Y"),
+            ("tilt", 3, "rad about X, Y, Z"),
+        ):
+            values = tuple(getattr(self, name))
+            if len(values) != length:
+                raise ValueError(f"{name} = {values}: {length} numbers are needed, {unit}")
+            object.__setattr__(
+                self, name, tuple(check.number(f"{name}[{i}]", v) for i, v in enumerate(values))
+            )
+        if max(map(abs, self.tilt[:2])) >= math.pi / 2:
+            raise ValueError(
+                f"tilt = {self.tilt}: allowed is less than a right angle about X and Y; "
+                "was it given in degrees?"
+            )
+
+    def rotation(self) -> NDArray[np.float64]:
+        """Rotation matrix, shape (3, 3): its columns are the element's axes."""
+        (cx, sx), (cy, sy), (cz, sz) = ((math.cos(a), math.sin(a)) for a in self.tilt)
+        about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+        about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+        about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+        return np.asarray(about_z @ about_y @ about_x)
+
+
+NOMINAL = Placement()
+"""Where it should be."""
 
 
 @dataclass(frozen=True)
@@ -63,31 +113,40 @@ class OpticalSystem:
     Parameters
     ----------
     name : str
-    elements : tuple of Lens and Plate
+    elements : tuple of Lens, SphericalLens, Plate and Aperture
     gaps : tuple of float
         Air between the vertices of one element and the next, mm, ≥ 0: one fewer than elements.
     sensor_distance : float, optional
         Air from the last vertex to the sensor's chip, mm.
+    placements : tuple of Placement
+        How each element deviates from its place; none means that no element does. Exact rays see
+        it, matrices do not.
+    sensor_placement : Placement
+        The same for the sensor, about the middle of its line.
 
     Raises
     ------
     ValueError
-        If there is no element, the number of gaps does not fit, or a distance is negative.
+        If there is no element, the number of gaps or placements does not fit, a distance is
+        negative, or elements overlap anywhere within their edges.
     """
 
     name: str
     elements: tuple[Element, ...]
     gaps: tuple[float, ...] = ()
     sensor_distance: float | None = None
+    placements: tuple[Placement, ...] = ()
+    sensor_placement: Placement = NOMINAL
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "elements", tuple(self.elements))
         object.__setattr__(self, "gaps", tuple(self.gaps))
+        object.__setattr__(self, "placements", tuple(self.placements))
         if not self.elements:
             raise ValueError(f"{self.name}: a system has at least one element")
         for element in self.elements:
             if not isinstance(element, Element):
-                raise TypeError(f"{self.name}: {element!r} is neither a Lens nor a Plate")
+                raise TypeError(f"{self.name}: {element!r} is no Lens, Plate or Aperture")
         if len(self.gaps) != len(self.elements) - 1:
             raise ValueError(
                 f"{self.name}: {len(self.elements)} elements have {len(self.elements) - 1} gaps "
@@ -102,6 +161,89 @@ class OpticalSystem:
             )
         if self.sensor_distance is not None:
             check.not_negative("sensor_distance", self.sensor_distance)
+        if self.placements and len(self.placements) != len(self.elements):
+            raise ValueError(
+                f"{self.name}: {len(self.placements)} placements for {len(self.elements)} elements; "
+                "give one for each, or none"
+            )
+        self._check_overlap()
+
+    def _check_overlap(self) -> None:
+        """Refuse elements that reach into each other, at any of 9 × 9 points within both."""
+        places = self.places()
+        layout = self.layout()
+        for number, (before, after) in enumerate(pairwise(self.elements)):
+            back, front = before.surfaces()[-1], after.surfaces()[0]
+            if not (back.bends or front.bends or self.placements):
+                continue  # parallel planes; gaps are ≥ 0
+            extent = [
+                min(before.size(m), after.size(m), key=lambda size: (math.isinf(size), size)) / 2
+                for m in MERIDIANS
+            ]
+            if math.inf in extent:
+                continue  # neither has a known edge
+            x, y = np.meshgrid(*(np.linspace(-half, half, 9) for half in extent))
+            if back.round or front.round:
+                within = x**2 + y**2 <= min(extent) ** 2 * (1 + 1e-9)
+                x, y = x[within], y[within]
+            x, y = x.ravel(), y.ravel()
+            if back.screen:
+                x, y = x[~back.opens(x, y)], y[~back.opens(x, y)]
+            rotation, origin = places[number]
+            points = rotation @ np.stack([x, y, back.z + back.sag(x, y)]) + origin[:, None]
+            rotation, origin = places[number + 1]
+            x, y, z = rotation.T @ (points - origin[:, None])
+            if front.screen:
+                solid = ~front.opens(x, y)
+                x, y, z = x[solid], y[solid], z[solid]
+            overlap = np.nan_to_num(z - front.sag(x, y), nan=-1.0)
+            if overlap.size and overlap.max() > 1e-9:
+                worst = int(overlap.argmax())
+                raise ValueError(
+                    f"{before.part} and {after.part} overlap by {overlap[worst]:.4g} mm at "
+                    f"x = {x[worst]:.4g}, y = {y[worst]:.4g} mm: their vertices are "
+                    f"{layout[number + 1].front - layout[number].back:g} mm apart; "
+                    "is the gap too small, or a lens the wrong way round?"
+                )
+
+    def places(self) -> tuple[tuple[NDArray[np.float64], NDArray[np.float64]], ...]:
+        """Rotation (3, 3) and front vertex (3,) of every element, then of the sensor if it has one.
+
+        The columns of the rotation are the element's axes in the frame of the system.
+        """
+        at = [placed.front for placed in self.layout()]
+        placements = list(self.placements) or [NOMINAL] * len(at)
+        if self.sensor_distance is not None:
+            at.append(self.length + self.sensor_distance)
+            placements.append(self.sensor_placement)
+        return tuple(
+            (placement.rotation(), np.array([*placement.decentre, z]))
+            for placement, z in zip(placements, at, strict=True)
+        )
+
+    def turned(self) -> OpticalSystem:
+        """Return the lenses as light from behind meets them, without a sensor.
+
+        Turned about Y by 180°: X and Z change sign.
+
+        Raises
+        ------
+        ValueError
+            If an element is off its place.
+        """
+        if any(placement != NOMINAL for placement in self.placements):
+            raise ValueError(
+                f"{self.name}: only a system of elements in their places can be turned"
+            )
+        return replace(
+            self,
+            name=f"{self.name}, turned",
+            elements=tuple(element.turned() for element in reversed(self.elements)),
+            gaps=tuple(reversed(self.gaps)),
+            sensor_distance=None,
+            placements=(),
+            sensor_placement=NOMINAL,
+        )
 
     @property
     def length(self) -> float:

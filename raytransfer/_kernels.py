@@ -1,0 +1,498 @@
+"""Compiled ray tracing: bare arrays, no checks. `tracing` and `irradiance` stand on it.
+
+Rays are traced in blocks, surface by surface, each surface in a loop without branches that the
+compiler turns into vector instructions. A block is one flat array of eight rows at constant offsets,
+by which the compiler sees that they do not overlap. Every ray is computed on its own, in full blocks,
+so results do not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+BLOCK = 1024
+X, Y, Z, DX, DY, DZ, W, LOST = (BLOCK * row for row in range(8))
+SIZE = 8 * BLOCK
+
+# as in tracing.Status; LOST holds 0 or 4 × surface + reason
+MISSED, BLOCKED, REFLECTED = 1.0, 2.0, 3.0
+
+_compile = njit(cache=True, error_model="numpy", fastmath={"contract"}, nogil=True)
+
+
+@_compile
+def _turn(b, step):
+    """Take positions and directions into the next frame."""
+    for i in range(BLOCK):
+        x, y, z = b[X + i], b[Y + i], b[Z + i]
+        b[X + i] = step[0, 0] * x + step[0, 1] * y + step[0, 2] * z + step[0, 3]
+        b[Y + i] = step[1, 0] * x + step[1, 1] * y + step[1, 2] * z + step[1, 3]
+        b[Z + i] = step[2, 0] * x + step[2, 1] * y + step[2, 2] * z + step[2, 3]
+        x, y, z = b[DX + i], b[DY + i], b[DZ + i]
+        b[DX + i] = step[0, 0] * x + step[0, 1] * y + step[0, 2] * z
+        b[DY + i] = step[1, 0] * x + step[1, 1] * y + step[1, 2] * z
+        b[DZ + i] = step[2, 0] * x + step[2, 1] * y + step[2, 2] * z
+
+
+@_compile
+def _shift(b, x, y, z):
+    """The same where the axes stay parallel."""
+    for i in range(BLOCK):
+        b[X + i] += x
+        b[Y + i] += y
+        b[Z + i] += z
+
+
+@_compile
+def _to_plane(b, code):
+    """Advance to z = 0; a ray that does not go there is lost."""
+    for i in range(BLOCK):
+        ahead = b[DZ + i] > 0.0
+        t = -b[Z + i] / (b[DZ + i] if ahead else 1.0)
+        b[X + i] += t * b[DX + i]
+        b[Y + i] += t * b[DY + i]
+        b[Z + i] = 0.0
+        old = b[LOST + i]
+        b[LOST + i] = old if (old != 0.0) | ahead else code + MISSED
+
+
+@_compile
+def _open(b, hx, hy, circle, code):
+    """Lose what is outside the opening, rectangular or round."""
+    if circle != 0.0:
+        for i in range(BLOCK):
+            inside = b[X + i] * b[X + i] + b[Y + i] * b[Y + i] <= hx * hx
+            old = b[LOST + i]
+            b[LOST + i] = old if (old != 0.0) | inside else code + BLOCKED
+    else:
+        for i in range(BLOCK):
+            inside = (abs(b[X + i]) <= hx) & (abs(b[Y + i]) <= hy)
+            old = b[LOST + i]
+            b[LOST + i] = old if (old != 0.0) | inside else code + BLOCKED
+
+
+@_compile
+def _refract_plane(b, n1, n2, hx, hy, code):
+    """From z = 0: opening and refraction at a plane with a rectangular edge.
+
+    Its normal is Z, so that only the cosine needs a root.
+    """
+    mu = n1 / n2
+    for i in range(BLOCK):
+        dz = b[DZ + i]
+        square = 1.0 - mu * mu * (1.0 - dz * dz)
+        through = square > 0.0
+        inside = (abs(b[X + i]) <= hx) & (abs(b[Y + i]) <= hy)
+        b[DX + i] *= mu
+        b[DY + i] *= mu
+        b[DZ + i] = np.sqrt(square if through else 1.0)
+        now = 0.0 if through else code + REFLECTED
+        now = now if inside else code + BLOCKED
+        old = b[LOST + i]
+        b[LOST + i] = old if old != 0.0 else now
+
+
+@_compile
+def _refract_curved(b, c, ax, ay, n1, n2, hx, hy, circle, code):
+    """Intersection, opening and refraction at a cylinder or sphere.
+
+    With F = c/2 (aₓ x² + a_y y² + z²) − z = 0 the gradient has length 1 on the surface, and its
+    product with the direction where light meets it is minus the root s of the discriminant: the
+    cosine of incidence costs nothing. Where the centre lies before the surface (a < 0) light meets
+    it on its way out of the cylinder or sphere, from wherever it came; where it lies behind, on its
+    way in, which must be ahead.
+    """
+    mu = n1 / n2
+    sx = ax * c
+    sy = ay * c
+    for i in range(BLOCK):
+        x, y, z = b[X + i], b[Y + i], b[Z + i]
+        dx, dy, dz = b[DX + i], b[DY + i], b[DZ + i]
+        a = sx * dx * dx + sy * dy * dy + c * dz * dz
+        half_b = sx * x * dx + sy * y * dy + (c * z - 1.0) * dz
+        f = sx * x * x + sy * y * y + (c * z - 2.0) * z
+        square = half_b * half_b - a * f
+        inward = half_b < 0.0
+        hit = (square > 0.0) & (inward | (a < 0.0))
+        s = np.sqrt(square if hit else 1.0)
+        # the same root twice, without cancellation
+        t = (f if inward else -half_b - s) / (s - half_b if inward else (a if hit else 1.0))
+        x += t * dx
+        y += t * dy
+        z += t * dz
+        inside = (x * x + y * y <= hx * hx) if circle != 0.0 else (abs(x) <= hx) & (abs(y) <= hy)
+        # the half of the cylinder or sphere that holds the vertex
+        hit &= c * z < 1.0
+        square = 1.0 - mu * mu * (1.0 - s * s)
+        through = square > 0.0
+        g = mu * s - np.sqrt(square if through else 1.0)
+        b[X + i], b[Y + i], b[Z + i] = x, y, z
+        b[DX + i] = mu * dx + g * sx * x
+        b[DY + i] = mu * dy + g * sy * y
+        b[DZ + i] = mu * dz + g * (c * z - 1.0)
+        now = 0.0 if through else code + REFLECTED
+        now = now if inside else code + BLOCKED
+        now = now if hit else code + MISSED
+        old = b[LOST + i]
+        b[LOST + i] = old if old != 0.0 else now
+
+
+@_compile
+def _transmit(b, c, sx, sy, n1, n2, before, kept):
+    """Fresnel's transmittance of unpolarised light, into W; what is reflected into `kept`.
+
+    `before` holds the direction before the surface (rows of a block), positions are on it.
+    """
+    for i in range(BLOCK):
+        nx, ny, nz = -sx * b[X + i], -sy * b[Y + i], 1.0 - c * b[Z + i]
+        cos1 = nx * before[i] + ny * before[BLOCK + i] + nz * before[2 * BLOCK + i]
+        cos2 = nx * b[DX + i] + ny * b[DY + i] + nz * b[DZ + i]
+        s_sum = n1 * cos1 + n2 * cos2
+        p_sum = n1 * cos2 + n2 * cos1
+        s_part = (n1 * cos1 - n2 * cos2) / s_sum
+        p_part = (n1 * cos2 - n2 * cos1) / p_sum
+        both = 2.0 * n1 * n2 * cos1 * cos2
+        alive = b[LOST + i] == 0.0
+        weight = b[W + i]
+        reflectance = 0.5 * (s_part * s_part + p_part * p_part)
+        transmittance = both / (s_sum * s_sum) + both / (p_sum * p_sum)
+        kept[i] = weight * reflectance if alive else 0.0
+        b[W + i] = weight * transmittance if alive else weight
+
+
+@_compile
+def through(b, steps, turned, shapes, indices, edges, fresnel, before, kept, reflected):
+    """Trace one block from the system's frame to the sensor's plane.
+
+    With `fresnel`, W is multiplied by each transmittance, and what every surface reflects is added
+    up in `reflected` (S,). A ray that is lost keeps the weight with which it was lost.
+    """
+    count = len(shapes)
+    for k in range(count):
+        step = steps[k]
+        if turned[k]:
+            _turn(b, step)
+        else:
+            _shift(b, step[0, 3], step[1, 3], step[2, 3])
+        code = 4.0 * k
+        c, ax, ay = shapes[k]
+        n1, n2 = indices[k]
+        hx, hy, circle = edges[k]
+        if k == 0 or c == 0.0:
+            # a source far away: what matters near the vertex would drown in its distance
+            _to_plane(b, code if c == 0.0 else -MISSED)  # the latter loses none
+        if n1 == 0.0:
+            _open(b, hx, hy, circle, code)
+            continue
+        if fresnel:
+            for i in range(3 * BLOCK):
+                before[i] = b[DX + i]
+        if c != 0.0:
+            _refract_curved(b, c, ax, ay, n1, n2, hx, hy, circle, code)
+        else:
+            if circle != 0.0:
+                _open(b, hx, hx, circle, code)
+                _refract_plane(b, n1, n2, hx, hx, code)
+            else:
+                _refract_plane(b, n1, n2, hx, hy, code)
+        if fresnel:
+            _transmit(b, c, ax * c, ay * c, n1, n2, before, kept)
+            total = 0.0
+            for i in range(BLOCK):
+                total += kept[i]
+            reflected[k] += total
+    step = steps[count]
+    if turned[count]:
+        _turn(b, step)
+    else:
+        _shift(b, step[0, 3], step[1, 3], step[2, 3])
+    _to_plane(b, 4.0 * count)
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"}, nogil=True, parallel=True)
+def trace(position, direction, rays, steps, turned, shapes, indices, edges, fresnel, out, lost):
+    """Trace rays (3, N) to the sensor: x, y, direction and transmission into out (6, N)."""
+    blocks = (rays + BLOCK - 1) // BLOCK
+    for j in prange(blocks):
+        b = np.empty(SIZE)
+        before = np.empty(3 * BLOCK)
+        kept = np.empty(BLOCK)
+        reflected = np.zeros(len(shapes))
+        start = j * BLOCK
+        size = min(BLOCK, rays - start)
+        for row in range(3):
+            for i in range(size):
+                b[row * BLOCK + i] = position[row, start + i]
+                b[(3 + row) * BLOCK + i] = direction[row, start + i]
+            for i in range(size, BLOCK):
+                b[row * BLOCK + i] = 0.0
+                b[(3 + row) * BLOCK + i] = 1.0
+        for i in range(BLOCK):
+            dx, dy, dz = b[DX + i], b[DY + i], b[DZ + i]
+            scale = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
+            b[DX + i] = dx * scale
+            b[DY + i] = dy * scale
+            b[DZ + i] = dz * scale
+            b[W + i] = 1.0
+            b[LOST + i] = 0.0
+        through(b, steps, turned, shapes, indices, edges, fresnel, before, kept, reflected)
+        for i in range(size):  # the lost ones hold numbers without meaning
+            alive = b[LOST + i] == 0.0
+            out[0, start + i] = b[X + i] if alive else 0.0
+            out[1, start + i] = b[Y + i] if alive else 0.0
+            out[2, start + i] = b[DX + i] if alive else 0.0
+            out[3, start + i] = b[DY + i] if alive else 0.0
+            out[4, start + i] = b[DZ + i] if alive else 0.0
+            out[5, start + i] = b[W + i] if alive else 0.0
+            lost[start + i] = np.int16(b[LOST + i])
+
+
+@_compile
+def _emit(b, first, count, ny, source, grid, lobe, facing):
+    """Rays `first` to `first + count` of a point source, row after row of each column, from z = 0.
+
+    grid is (low x, step x, low y, step y) on that plane. W becomes radiant intensity × solid angle;
+    the intensity is 1, or by the cosine to `facing` from a table over 0 to 1. Rays beyond `count`
+    carry nothing.
+    """
+    for i in range(BLOCK):
+        ray = min(first + i, first + count - 1)
+        column = ray // ny
+        u = grid[0] + (column + 0.5) * grid[1]
+        v = grid[2] + (ray - column * ny + 0.5) * grid[3]
+        dx = u - source[0]
+        dy = v - source[1]
+        dz = source[2]
+        square = dx * dx + dy * dy + dz * dz
+        scale = 1.0 / np.sqrt(square)
+        b[X + i] = u
+        b[Y + i] = v
+        b[Z + i] = 0.0
+        b[DX + i] = dx * scale
+        b[DY + i] = dy * scale
+        b[DZ + i] = dz * scale
+        b[W + i] = grid[1] * grid[3] * dz * scale / square
+        b[LOST + i] = 0.0
+    last = len(lobe) - 1
+    if last > 0:
+        for i in range(BLOCK):
+            cosine = b[DX + i] * facing[0] + b[DY + i] * facing[1] + b[DZ + i] * facing[2]
+            at = max(cosine, 0.0) * last
+            k = min(int(at), last - 1)
+            b[W + i] *= (lobe[k] + (at - k) * (lobe[k + 1] - lobe[k])) * (cosine > 0.0)
+    for i in range(count, BLOCK):
+        b[W + i] = 0.0
+
+
+@_compile
+def _columns(first, columns, ny, source, grid, lobe, facing, parts, fresnel, work, rays, reflected):
+    """Trace whole columns of the pupil into rays (4, …): x, y, weight and LOST at the sensor.
+
+    Returns the emitted power.
+    """
+    b, before, kept = work
+    steps, turned, shapes, indices, edges = parts
+    emitted = 0.0
+    count = columns * ny
+    for start in range(0, count, BLOCK):
+        size = min(BLOCK, count - start)
+        _emit(b, first * ny + start, size, ny, source, grid, lobe, facing)
+        for i in range(size):
+            emitted += b[W + i]
+        through(b, steps, turned, shapes, indices, edges, fresnel, before, kept, reflected)
+        for i in range(size):
+            rays[0, start + i] = b[X + i]
+            rays[1, start + i] = b[Y + i]
+            rays[2, start + i] = b[W + i]
+            rays[3, start + i] = b[LOST + i]
+    return emitted
+
+
+@_compile
+def _slope(rays, row, at, low, high):
+    """Change of a coordinate per cell: from both neighbours, from the one that arrived, or 0."""
+    below = low >= 0 and rays[3, low] == 0.0
+    above = high >= 0 and rays[3, high] == 0.0
+    if below and above:
+        return 0.5 * (rays[row, high] - rays[row, low])
+    if above:
+        return rays[row, high] - rays[row, at]
+    if below:
+        return rays[row, at] - rays[row, low]
+    return 0.0
+
+
+@_compile
+def _on_line(rays, at, low, high, half):
+    """Which part of a cell's light lies on the pixel line, |y| ≤ half, and where along the line.
+
+    `low` and `high` are the cells beside it across the line. The cell's light is taken as spread
+    evenly between the middles to its neighbours.
+
+    Returns
+    -------
+    share, x
+        x is the middle of that part, mm.
+    beside
+        The share below and above the line, on its own.
+    spread
+        How much of the line it covers because x changes along the cell, mm.
+    """
+    y = rays[1, at]
+    rise = _slope(rays, 1, at, low, high)
+    if rise == 0.0:
+        if abs(y) <= half:
+            return 1.0, rays[0, at], 0.0, 0.0
+        return 0.0, rays[0, at], 1.0, 0.0
+    first = (-half - y) / rise
+    last = (half - y) / rise
+    if first > last:
+        first, last = last, first
+    first = min(max(first, -0.5), 0.5)
+    last = min(max(last, -0.5), 0.5)
+    drift = _slope(rays, 0, at, low, high)
+    middle = rays[0, at] + drift * 0.5 * (first + last)
+    return last - first, middle, (first + 0.5) + (0.5 - last), abs(drift) * (last - first)
+
+
+@_compile
+def _spread(pixels, power, middle, width, pitch):
+    """Put power evenly on the interval around `middle`; returns what falls beyond the ends."""
+    count = len(pixels)
+    low = (middle - 0.5 * width) / pitch + 0.5 * count
+    high = (middle + 0.5 * width) / pitch + 0.5 * count
+    if high - low < 1e-9:
+        at = np.floor(0.5 * (low + high))
+        if 0.0 <= at < count:
+            pixels[int(at)] += power
+            return 0.0
+        return power
+    density = power / (high - low)
+    beyond = density * (max(0.0, min(high, 0.0) - low) + max(0.0, high - max(low, float(count))))
+    first = max(low, 0.0)
+    last = min(high, float(count))
+    if first >= last:
+        return beyond
+    k = int(first)
+    end = min(int(last), count - 1)
+    if k == end:
+        pixels[k] += density * (last - first)
+        return beyond
+    pixels[k] += density * (k + 1 - first)
+    for p in range(k + 1, end):
+        pixels[p] += density
+    pixels[end] += density * (last - end)
+    return beyond
+
+
+STRIPS = 256
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"}, nogil=True, parallel=True)
+def illuminate(
+    nx, ny, source, grid, lobe, facing,
+    steps, turned, shapes, indices, edges, fresnel,
+    pitch, half, pixels, account,
+):  # fmt: skip
+    """Light of a point source on the pixels: a cell of the pupil at a time, evenly over its image.
+
+    pixels : (pixels,), added to. account : (S + 1, 4) of power missed, blocked, totally reflected
+    and partly reflected at each surface; the last row is emitted, beside the line, beyond its ends.
+    """
+    parts = (steps, turned, shapes, indices, edges)
+    surfaces = len(shapes)
+    width = max(1, max(16 * BLOCK // ny, (nx + STRIPS - 1) // STRIPS))
+    strips = (nx + width - 1) // width
+    each_pixels = np.zeros((strips, len(pixels)))
+    each_account = np.zeros((strips, surfaces + 1, 4))
+    for strip in prange(strips):
+        work = (np.empty(SIZE), np.empty(3 * BLOCK), np.empty(BLOCK))
+        mine = each_account[strip]
+        reflected = np.zeros(surfaces)
+        ignored = np.zeros(surfaces)
+        first = strip * width
+        columns = min(width, nx - first)
+        # one more column on each side, traced only for the slopes
+        rays = np.empty((4, (columns + 2) * ny))
+        rays[3] = 1.0
+        own = rays[:, ny : (columns + 1) * ny]
+        mine[surfaces, 0] = _columns(
+            first, columns, ny, source, grid, lobe, facing, parts, fresnel, work, own, reflected
+        )
+        if first > 0:
+            _columns(
+                first - 1, 1, ny, source, grid, lobe, facing, parts, fresnel, work,
+                rays[:, :ny], ignored,
+            )  # fmt: skip
+        if first + columns < nx:
+            _columns(
+                first + columns, 1, ny, source, grid, lobe, facing, parts, fresnel, work,
+                rays[:, (columns + 1) * ny :], ignored,
+            )  # fmt: skip
+        for column in range(1, columns + 1):
+            for row in range(ny):
+                at = column * ny + row
+                weight = rays[2, at]
+                lost = int(rays[3, at])
+                if lost != 0:
+                    mine[min(lost >> 2, surfaces - 1), (lost & 3) - 1] += weight
+                    continue
+                share, middle, beside, drift = _on_line(
+                    rays, at, at - 1 if row > 0 else -1, at + 1 if row < ny - 1 else -1, half
+                )
+                mine[surfaces, 1] += weight * beside
+                if share > 0.0:
+                    slope = _slope(rays, 0, at, at - ny, at + ny)
+                    mine[surfaces, 2] += _spread(
+                        each_pixels[strip], weight * share, middle, abs(slope) + drift, pitch
+                    )
+        mine[:surfaces, 3] = reflected
+    for strip in range(strips):
+        pixels += each_pixels[strip]
+        account += each_account[strip]
+
+
+@_compile
+def columns_of(nx, ny, source, grid, steps, turned, shapes, indices, edges, half, columns):
+    """Into columns (2, nx): the light each column of the pupil puts on the line, and where, mm.
+
+    Returns the first and the last row that put any there.
+    """
+    parts = (steps, turned, shapes, indices, edges)
+    work = (np.empty(SIZE), np.empty(3 * BLOCK), np.empty(BLOCK))
+    rays = np.empty((4, nx * ny))
+    no_lobe, ahead = np.empty(0), np.zeros(3)
+    _columns(
+        0, nx, ny, source, grid, no_lobe, ahead, parts, True, work, rays, np.zeros(len(shapes))
+    )
+    first, last = ny, -1
+    for column in range(nx):
+        total = 0.0
+        moment = 0.0
+        for row in range(ny):
+            at = column * ny + row
+            if rays[3, at] != 0.0:
+                continue
+            share, middle, _, _ = _on_line(
+                rays, at, at - 1 if row > 0 else -1, at + 1 if row < ny - 1 else -1, half
+            )
+            if share > 0.0:
+                first = min(first, row)
+                last = max(last, row)
+                total += share * rays[2, at]
+                moment += share * rays[2, at] * middle
+        columns[0, column] = total
+        columns[1, column] = moment / total if total > 0.0 else 0.0
+    return first, last
+
+
+@_compile
+def lay(columns, scale, pitch, pixels):
+    """Lay columns (2, N) of light on the pixels, each between the middles to its neighbours."""
+    count = columns.shape[1]
+    for k in range(count):
+        low = columns[1, max(k - 1, 0)]
+        high = columns[1, min(k + 1, count - 1)]
+        width = abs(high - low) / (min(k + 1, count - 1) - max(k - 1, 0))
+        _spread(pixels, columns[0, k] * scale, columns[1, k], width, pitch)
