@@ -18,6 +18,8 @@ SIZE = 8 * BLOCK
 # as in tracing.Status; LOST holds 0 or 4 × surface + reason
 MISSED, BLOCKED, REFLECTED = 1.0, 2.0, 3.0
 
+TINY = 1e-100  # as in tracing
+
 _compile = njit(cache=True, error_model="numpy", fastmath={"contract"}, nogil=True)
 
 
@@ -36,22 +38,14 @@ def _turn(b, step):
 
 
 @_compile
-def _shift(b, x, y, z):
-    """The same where the axes stay parallel."""
+def _to_plane(b, x, y, z, code):
+    """Shift the origin, then advance to z = 0; a ray that does not go there is lost."""
     for i in range(BLOCK):
-        b[X + i] += x
-        b[Y + i] += y
-        b[Z + i] += z
-
-
-@_compile
-def _to_plane(b, code):
-    """Advance to z = 0; a ray that does not go there is lost."""
-    for i in range(BLOCK):
-        ahead = b[DZ + i] > 0.0
-        t = -b[Z + i] / (b[DZ + i] if ahead else 1.0)
-        b[X + i] += t * b[DX + i]
-        b[Y + i] += t * b[DY + i]
+        dz = b[DZ + i]
+        ahead = dz > TINY
+        t = -(b[Z + i] + z) / (dz if ahead else 1.0)
+        b[X + i] += x + t * b[DX + i]
+        b[Y + i] += y + t * b[DY + i]
         b[Z + i] = 0.0
         old = b[LOST + i]
         b[LOST + i] = old if (old != 0.0) | ahead else code + MISSED
@@ -60,45 +54,51 @@ def _to_plane(b, code):
 @_compile
 def _open(b, hx, hy, circle, code):
     """Lose what is outside the opening, rectangular or round."""
-    if circle != 0.0:
-        for i in range(BLOCK):
-            inside = b[X + i] * b[X + i] + b[Y + i] * b[Y + i] <= hx * hx
-            old = b[LOST + i]
-            b[LOST + i] = old if (old != 0.0) | inside else code + BLOCKED
-    else:
-        for i in range(BLOCK):
-            inside = (abs(b[X + i]) <= hx) & (abs(b[Y + i]) <= hy)
-            old = b[LOST + i]
-            b[LOST + i] = old if (old != 0.0) | inside else code + BLOCKED
+    for i in range(BLOCK):
+        x, y = b[X + i], b[Y + i]
+        inside = (x * x + y * y <= hx * hx) if circle != 0.0 else (abs(x) <= hx) & (abs(y) <= hy)
+        old = b[LOST + i]
+        b[LOST + i] = old if (old != 0.0) | inside else code + BLOCKED
 
 
 @_compile
-def _refract_plane(b, n1, n2, hx, hy, code):
-    """From z = 0: opening and refraction at a plane with a rectangular edge.
-
-    Its normal is Z, so that only the cosine needs a root.
-    """
+def _plane(b, x, y, z, n1, n2, hx, hy, circle, code, fresnel, kept):
+    """Shift, advance, open and refract at a plane: its normal is Z, one root does."""
     mu = n1 / n2
     for i in range(BLOCK):
-        dz = b[DZ + i]
-        square = 1.0 - mu * mu * (1.0 - dz * dz)
-        through = square > 0.0
-        inside = (abs(b[X + i]) <= hx) & (abs(b[Y + i]) <= hy)
-        b[DX + i] *= mu
-        b[DY + i] *= mu
-        b[DZ + i] = np.sqrt(square if through else 1.0)
-        now = 0.0 if through else code + REFLECTED
+        dx, dy, dz = b[DX + i], b[DY + i], b[DZ + i]
+        hit = dz > TINY
+        cos1 = dz if hit else 1.0
+        t = -(b[Z + i] + z) / cos1
+        px = b[X + i] + x + t * dx
+        py = b[Y + i] + y + t * dy
+        square = 1.0 - mu * mu * (1.0 - cos1 * cos1)
+        refracts = square > 0.0
+        cos2 = np.sqrt(square if refracts else 1.0)
+        inside = (
+            (px * px + py * py <= hx * hx) if circle != 0.0 else (abs(px) <= hx) & (abs(py) <= hy)
+        )
+        b[X + i], b[Y + i], b[Z + i] = px, py, 0.0
+        b[DX + i], b[DY + i], b[DZ + i] = mu * dx, mu * dy, cos2
+        now = 0.0 if refracts else code + REFLECTED
         now = now if inside else code + BLOCKED
+        now = now if hit else code + MISSED
         old = b[LOST + i]
-        b[LOST + i] = old if old != 0.0 else now
+        now = old if old != 0.0 else now
+        b[LOST + i] = now
+        if fresnel:
+            reflected, transmitted = _fresnel(n1, n2, cos1, cos2)
+            weight = b[W + i]
+            kept[i] = weight * reflected if now == 0.0 else 0.0
+            b[W + i] = weight * transmitted if now == 0.0 else weight
 
 
 @_compile
-def _refract_curved(b, c, ax, ay, n1, n2, hx, hy, circle, code):
-    """Intersection, opening and refraction at a cylinder or sphere.
+def _curved(b, x, y, z, c, ax, ay, n1, n2, hx, hy, circle, code, fresnel, kept):
+    """Shift, intersect, open and refract at a cylinder or sphere.
 
     With F = c/2 (aₓ x² + a_y y² + z²) − z = 0 the gradient has length 1 on the surface, and its
-    product with the direction where light meets it is minus the root s of the discriminant: the
+    product with the direction where light meets it is minus the root of the discriminant: the
     cosine of incidence costs nothing. Where the centre lies before the surface (a < 0) light meets
     it on its way out of the cylinder or sphere, from wherever it came; where it lies behind, on its
     way in, which must be ahead.
@@ -107,107 +107,102 @@ def _refract_curved(b, c, ax, ay, n1, n2, hx, hy, circle, code):
     sx = ax * c
     sy = ay * c
     for i in range(BLOCK):
-        x, y, z = b[X + i], b[Y + i], b[Z + i]
+        px, py, pz = b[X + i] + x, b[Y + i] + y, b[Z + i] + z
         dx, dy, dz = b[DX + i], b[DY + i], b[DZ + i]
         a = sx * dx * dx + sy * dy * dy + c * dz * dz
-        half_b = sx * x * dx + sy * y * dy + (c * z - 1.0) * dz
-        f = sx * x * x + sy * y * y + (c * z - 2.0) * z
+        half_b = sx * px * dx + sy * py * dy + (c * pz - 1.0) * dz
+        f = sx * px * px + sy * py * py + (c * pz - 2.0) * pz
         square = half_b * half_b - a * f
         inward = half_b < 0.0
         hit = (square > 0.0) & (inward | (a < 0.0))
-        s = np.sqrt(square if hit else 1.0)
-        # the same root twice, without cancellation
-        t = (f if inward else -half_b - s) / (s - half_b if inward else (a if hit else 1.0))
-        x += t * dx
-        y += t * dy
-        z += t * dz
-        inside = (x * x + y * y <= hx * hx) if circle != 0.0 else (abs(x) <= hx) & (abs(y) <= hy)
+        cos1 = np.sqrt(square if hit else 1.0)
+        # the same root twice, each without cancellation
+        t = (f if inward else -half_b - cos1) / (cos1 - half_b if inward else (a if hit else 1.0))
+        px += t * dx
+        py += t * dy
+        pz += t * dz
         # the half of the cylinder or sphere that holds the vertex
-        hit &= c * z < 1.0
-        square = 1.0 - mu * mu * (1.0 - s * s)
-        through = square > 0.0
-        g = mu * s - np.sqrt(square if through else 1.0)
-        b[X + i], b[Y + i], b[Z + i] = x, y, z
-        b[DX + i] = mu * dx + g * sx * x
-        b[DY + i] = mu * dy + g * sy * y
-        b[DZ + i] = mu * dz + g * (c * z - 1.0)
-        now = 0.0 if through else code + REFLECTED
+        hit &= c * pz < 1.0
+        square = 1.0 - mu * mu * (1.0 - cos1 * cos1)
+        refracts = square > 0.0
+        cos2 = np.sqrt(square if refracts else 1.0)
+        inside = (
+            (px * px + py * py <= hx * hx) if circle != 0.0 else (abs(px) <= hx) & (abs(py) <= hy)
+        )
+        g = mu * cos1 - cos2
+        b[X + i], b[Y + i], b[Z + i] = px, py, pz
+        b[DX + i] = mu * dx + g * sx * px
+        b[DY + i] = mu * dy + g * sy * py
+        b[DZ + i] = mu * dz + g * (c * pz - 1.0)
+        now = 0.0 if refracts else code + REFLECTED
         now = now if inside else code + BLOCKED
         now = now if hit else code + MISSED
         old = b[LOST + i]
-        b[LOST + i] = old if old != 0.0 else now
+        now = old if old != 0.0 else now
+        b[LOST + i] = now
+        if fresnel:
+            reflected, transmitted = _fresnel(n1, n2, cos1, cos2)
+            weight = b[W + i]
+            kept[i] = weight * reflected if now == 0.0 else 0.0
+            b[W + i] = weight * transmitted if now == 0.0 else weight
+
+
+@njit(inline="always")
+def _fresnel(n1, n2, cos1, cos2):
+    """Reflectance and transmittance of unpolarised light, each by its own formula."""
+    s1, s2 = n1 * cos1, n2 * cos2
+    p1, p2 = n1 * cos2, n2 * cos1
+    s, p = s1 + s2, p1 + p2
+    scale = 1.0 / (s * p)
+    s_part = (s1 - s2) * p * scale
+    p_part = (p1 - p2) * s * scale
+    both = 2.0 * n1 * n2 * cos1 * cos2 * scale * scale
+    return 0.5 * (s_part * s_part + p_part * p_part), both * (s * s + p * p)
+
+
+@njit(cache=True, fastmath={"contract", "reassoc"}, nogil=True)
+def _sum(values, count):
+    """Add up the first values; always in the same order."""
+    total = 0.0
+    for i in range(count):
+        total += values[i]
+    return total
 
 
 @_compile
-def _transmit(b, c, sx, sy, n1, n2, before, kept):
-    """Fresnel's transmittance of unpolarised light, into W; what is reflected into `kept`.
-
-    `before` holds the direction before the surface (rows of a block), positions are on it.
-    """
-    for i in range(BLOCK):
-        nx, ny, nz = -sx * b[X + i], -sy * b[Y + i], 1.0 - c * b[Z + i]
-        cos1 = nx * before[i] + ny * before[BLOCK + i] + nz * before[2 * BLOCK + i]
-        cos2 = nx * b[DX + i] + ny * b[DY + i] + nz * b[DZ + i]
-        s_sum = n1 * cos1 + n2 * cos2
-        p_sum = n1 * cos2 + n2 * cos1
-        s_part = (n1 * cos1 - n2 * cos2) / s_sum
-        p_part = (n1 * cos2 - n2 * cos1) / p_sum
-        both = 2.0 * n1 * n2 * cos1 * cos2
-        alive = b[LOST + i] == 0.0
-        weight = b[W + i]
-        reflectance = 0.5 * (s_part * s_part + p_part * p_part)
-        transmittance = both / (s_sum * s_sum) + both / (p_sum * p_sum)
-        kept[i] = weight * reflectance if alive else 0.0
-        b[W + i] = weight * transmittance if alive else weight
-
-
-@_compile
-def through(b, steps, turned, shapes, indices, edges, fresnel, before, kept, reflected):
+def through(b, steps, turned, shapes, indices, edges, fresnel, kept, reflected):
     """Trace one block from the system's frame to the sensor's plane.
 
     With `fresnel`, W is multiplied by each transmittance, and what every surface reflects is added
     up in `reflected` (S,). A ray that is lost keeps the weight with which it was lost.
     """
     count = len(shapes)
-    for k in range(count):
+    for k in range(count + 1):
         step = steps[k]
+        x, y, z = step[0, 3], step[1, 3], step[2, 3]
+        code = 4.0 * k
         if turned[k]:
             _turn(b, step)
-        else:
-            _shift(b, step[0, 3], step[1, 3], step[2, 3])
-        code = 4.0 * k
+            x = y = z = 0.0
+        if k == count:
+            _to_plane(b, x, y, z, code)
+            return
         c, ax, ay = shapes[k]
         n1, n2 = indices[k]
         hx, hy, circle = edges[k]
-        if k == 0 or c == 0.0:
-            # a source far away: what matters near the vertex would drown in its distance
-            _to_plane(b, code if c == 0.0 else -MISSED)  # the latter loses none
         if n1 == 0.0:
+            _to_plane(b, x, y, z, code)
             _open(b, hx, hy, circle, code)
             continue
-        if fresnel:
-            for i in range(3 * BLOCK):
-                before[i] = b[DX + i]
-        if c != 0.0:
-            _refract_curved(b, c, ax, ay, n1, n2, hx, hy, circle, code)
+        if c == 0.0:
+            _plane(b, x, y, z, n1, n2, hx, hy, circle, code, fresnel, kept)
         else:
-            if circle != 0.0:
-                _open(b, hx, hx, circle, code)
-                _refract_plane(b, n1, n2, hx, hx, code)
-            else:
-                _refract_plane(b, n1, n2, hx, hy, code)
+            if k == 0:  # from far away, what matters near the vertex would drown in the distance
+                _to_plane(b, x, y, z, -MISSED)  # loses none: it may be met from aside
+                x = y = z = 0.0
+            _curved(b, x, y, z, c, ax, ay, n1, n2, hx, hy, circle, code, fresnel, kept)
         if fresnel:
-            _transmit(b, c, ax * c, ay * c, n1, n2, before, kept)
-            total = 0.0
-            for i in range(BLOCK):
-                total += kept[i]
-            reflected[k] += total
-    step = steps[count]
-    if turned[count]:
-        _turn(b, step)
-    else:
-        _shift(b, step[0, 3], step[1, 3], step[2, 3])
-    _to_plane(b, 4.0 * count)
+            reflected[k] += _sum(kept, BLOCK)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"}, nogil=True, parallel=True)
@@ -216,7 +211,6 @@ def trace(position, direction, rays, steps, turned, shapes, indices, edges, fres
     blocks = (rays + BLOCK - 1) // BLOCK
     for j in prange(blocks):
         b = np.empty(SIZE)
-        before = np.empty(3 * BLOCK)
         kept = np.empty(BLOCK)
         reflected = np.zeros(len(shapes))
         start = j * BLOCK
@@ -236,7 +230,7 @@ def trace(position, direction, rays, steps, turned, shapes, indices, edges, fres
             b[DZ + i] = dz * scale
             b[W + i] = 1.0
             b[LOST + i] = 0.0
-        through(b, steps, turned, shapes, indices, edges, fresnel, before, kept, reflected)
+        through(b, steps, turned, shapes, indices, edges, fresnel, kept, reflected)
         for i in range(size):  # the lost ones hold numbers without meaning
             alive = b[LOST + i] == 0.0
             out[0, start + i] = b[X + i] if alive else 0.0
@@ -291,16 +285,15 @@ def _columns(first, columns, ny, source, grid, lobe, facing, parts, fresnel, wor
 
     Returns the emitted power.
     """
-    b, before, kept = work
+    b, kept = work
     steps, turned, shapes, indices, edges = parts
     emitted = 0.0
     count = columns * ny
     for start in range(0, count, BLOCK):
         size = min(BLOCK, count - start)
         _emit(b, first * ny + start, size, ny, source, grid, lobe, facing)
-        for i in range(size):
-            emitted += b[W + i]
-        through(b, steps, turned, shapes, indices, edges, fresnel, before, kept, reflected)
+        emitted += _sum(b[W:], size)
+        through(b, steps, turned, shapes, indices, edges, fresnel, kept, reflected)
         for i in range(size):
             rays[0, start + i] = b[X + i]
             rays[1, start + i] = b[Y + i]
@@ -407,7 +400,7 @@ def illuminate(
     each_pixels = np.zeros((strips, len(pixels)))
     each_account = np.zeros((strips, surfaces + 1, 4))
     for strip in prange(strips):
-        work = (np.empty(SIZE), np.empty(3 * BLOCK), np.empty(BLOCK))
+        work = (np.empty(SIZE), np.empty(BLOCK))
         mine = each_account[strip]
         reflected = np.zeros(surfaces)
         ignored = np.zeros(surfaces)
@@ -455,12 +448,13 @@ def illuminate(
 
 @_compile
 def columns_of(nx, ny, source, grid, steps, turned, shapes, indices, edges, half, columns):
-    """Into columns (2, nx): the light each column of the pupil puts on the line, and where, mm.
+    """Into columns (3, nx): the light each column of the pupil puts on the line, where, how wide, mm.
 
-    Returns the first and the last row that put any there.
+    The width is that of an even spread with the same variance. Returns the first and the last row
+    that put any light there.
     """
     parts = (steps, turned, shapes, indices, edges)
-    work = (np.empty(SIZE), np.empty(3 * BLOCK), np.empty(BLOCK))
+    work = (np.empty(SIZE), np.empty(BLOCK))
     rays = np.empty((4, nx * ny))
     no_lobe, ahead = np.empty(0), np.zeros(3)
     _columns(
@@ -470,29 +464,36 @@ def columns_of(nx, ny, source, grid, steps, turned, shapes, indices, edges, half
     for column in range(nx):
         total = 0.0
         moment = 0.0
+        square = 0.0
         for row in range(ny):
             at = column * ny + row
             if rays[3, at] != 0.0:
                 continue
-            share, middle, _, _ = _on_line(
+            share, middle, _, drift = _on_line(
                 rays, at, at - 1 if row > 0 else -1, at + 1 if row < ny - 1 else -1, half
             )
             if share > 0.0:
                 first = min(first, row)
                 last = max(last, row)
-                total += share * rays[2, at]
-                moment += share * rays[2, at] * middle
-        columns[0, column] = total
-        columns[1, column] = moment / total if total > 0.0 else 0.0
+                light = share * rays[2, at]
+                total += light
+                moment += light * middle
+                square += light * (middle * middle + drift * drift / 12.0)
+        columns[:, column] = 0.0
+        if total > 0.0:
+            mean = moment / total
+            columns[0, column] = total
+            columns[1, column] = mean
+            columns[2, column] = np.sqrt(12.0 * max(square / total - mean * mean, 0.0))
     return first, last
 
 
 @_compile
 def lay(columns, scale, pitch, pixels):
-    """Lay columns (2, N) of light on the pixels, each between the middles to its neighbours."""
+    """Lay columns (3, N) of light on the pixels: between the middles to the neighbours, and wider."""
     count = columns.shape[1]
     for k in range(count):
         low = columns[1, max(k - 1, 0)]
         high = columns[1, min(k + 1, count - 1)]
         width = abs(high - low) / (min(k + 1, count - 1) - max(k - 1, 0))
-        _spread(pixels, columns[0, k] * scale, columns[1, k], width, pitch)
+        _spread(pixels, columns[0, k] * scale, columns[1, k], width + abs(columns[2, k]), pitch)

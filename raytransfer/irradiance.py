@@ -17,7 +17,6 @@ import numpy as np
 from raytransfer import _checks as check
 from raytransfer.prescription import prescription
 from raytransfer.sensors import TCD1304, LineSensor
-from raytransfer.sources import Emitter
 from raytransfer.tracing import check_source, front_opening, load_kernels, using
 
 if TYPE_CHECKING:
@@ -25,6 +24,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
+    from raytransfer.sources import Emitter
     from raytransfer.systems import OpticalSystem
 
 PLANCK = 6.62607015e-34  # J s
@@ -302,12 +302,12 @@ class LightTable:
     COLUMNS = 128
     ROWS = 16
     ROUGH = (32, 64)
-    STEPS = (0.05, 0.1, 5e-4)
+    STEPS = (0.05, 0.05, 2.5e-4)
     """Of the lattice: slopes, and 1/mm."""
     CLOSEST = 200.0
     """Nearer sources than this, mm, are computed anew each time."""
     CELLS = 512
-    """So many of its cells are kept, 0.13 MB each."""
+    """So many of its cells are kept, 0.2 MB each."""
 
     def __init__(
         self, system: OpticalSystem, sensor: LineSensor = TCD1304, *, wavelength: float = 0.63
@@ -355,12 +355,12 @@ class LightTable:
             return pixels
         weights = [_cubic(value - start) for value, start in zip(at, first, strict=True)]
         along = np.multiply.outer(np.multiply.outer(weights[0], weights[1]), weights[2]).ravel()
-        columns = (along @ cell).reshape(2, -1)
+        columns = (along @ cell).reshape(3, -1)
         self._kernels.lay(columns, 1 / distance**2, self.sensor.pitch, pixels)
         return pixels
 
     def _cell(self, first: tuple[int, int, int]) -> NDArray[np.float64] | None:
-        """The 64 nodes around a cell, shape (64, 2 COLUMNS); empty in the dark, None at its rim."""
+        """The 64 nodes around a cell, shape (64, 3 COLUMNS); empty in the dark, None at its rim."""
         if first in self._cells:
             self._cells.move_to_end(first)
             return self._cells[first]
@@ -387,7 +387,7 @@ class LightTable:
         return self._nodes[index]
 
     def _pupil(self, position: tuple[float, float, float]) -> NDArray[np.float64]:
-        """Light × distance² and place on the line of the open pupil's columns, one after the other.
+        """Light × distance², place on the line and width of the open pupil's columns, in turn.
 
         Empty where no light gets to the line.
         """
@@ -427,10 +427,10 @@ class LightTable:
         nx: int,
         ny: int,
     ) -> tuple[NDArray[np.float64], tuple[int, int]]:
-        """Light and place of each column of an area of the front, and the first and last lit row."""
+        """Light, place and width of each column of an area of the front; first and last lit row."""
         low_x, high_x, low_y, high_y = area
         grid = np.array([low_x, (high_x - low_x) / nx, low_y, (high_y - low_y) / ny])
-        columns = np.empty((2, nx))
+        columns = np.empty((3, nx))
         rows = self._kernels.columns_of(
             nx, ny, np.array(position), grid, *self._parts, self.sensor.pixel_height / 2, columns
         )

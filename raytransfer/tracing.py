@@ -15,7 +15,6 @@ import numpy as np
 from raytransfer import _checks as check
 from raytransfer.materials import D_LINE
 from raytransfer.prescription import prescription, surface_frames
-from raytransfer.systems import MERIDIANS
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -23,6 +22,9 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from raytransfer.systems import OpticalSystem
+
+TINY = 1e-100
+"""Below it a direction's z counts as 0, and squares of lengths underflow."""
 
 
 class Status(IntEnum):
@@ -39,14 +41,14 @@ class Status(IntEnum):
 
 @dataclass(frozen=True)
 class Trace:
-    """Rays on the sensor's plane; of lost ones every number but `direction` is 0.
+    """Rays on the sensor's plane; of lost ones these numbers are 0.
 
     Attributes
     ----------
     x, y : ndarray, shape (N,)
         Along the pixel line and across it, mm, in the frame of the sensor.
     direction : ndarray, shape (3, N)
-        Unit vectors in that frame; without meaning for lost rays.
+        Unit vectors in that frame.
     transmission : ndarray, shape (N,)
         Product of Fresnel's transmittances, or 1 without them.
     status : ndarray of uint8, shape (N,)
@@ -134,23 +136,26 @@ def checked_rays(
             f"direction: z = {toward[2].min():g} of ray {toward[2].argmin()}; light goes forward, "
             "z > 0"
         )
+    if toward[2].min() < TINY or max(-toward.min(), toward.max()) > 1 / TINY:
+        toward = toward / np.abs(toward).max(axis=0)  # its square would overflow
     front, rotation, origin = surface_frames(system)[0]
-    size = [system.elements[0].size(meridian) / 2 for meridian in MERIDIANS]
-    corners = np.where(np.isfinite(size), size, 0.0)
-    depth = float(np.nan_to_num(front.sag(*corners)))
-    tilt = np.abs(rotation[2, :2]) @ corners
-    if start[2].max() < origin[2] + min(depth, 0.0) - tilt:
+    first = system.elements[0]
+    size = (first.size("x") / 2, first.size("y") / 2)
+    foremost = min(front.depth(size), 0.0)
+    tilt = np.abs(rotation[2, :2]) @ np.where(np.isfinite(size), size, 0.0)
+    if start[2].max() < origin[2] + foremost - tilt:
         return start, toward  # all of them before everything: the usual case
     x, y, z = rotation.T @ (start - origin[:, None])
-    beside = (np.abs(x) > size[0]) | (np.abs(y) > size[1]) | front.opens(x, y) & front.screen
-    behind = ~beside & (np.nan_to_num(z - front.sag(x, y), nan=-1.0) > 0)
-    behind |= start[2] > system.length
+    beside = (np.abs(x) > size[0]) | (np.abs(y) > size[1])
+    if front.round:
+        beside |= np.hypot(x, y) > size[0]
+    # beside the lens it may not stand behind any of it: the ray would be traced back to the front
+    behind = z > np.where(beside, foremost, np.nan_to_num(front.sag(x, y)))
     if behind.any():
         ray = int(behind.argmax())
         raise ValueError(
             f"position of ray {ray} = {tuple(map(float, start[:, ray]))} mm: it is in or behind "
-            f"{system.elements[0].part}, whose vertex is at z = {origin[2]:g}; sources have "
-            "negative z"
+            f"{first.part}, whose vertex is at z = {origin[2]:g}; sources have negative z"
         )
     return start, toward
 
@@ -233,20 +238,20 @@ def front_opening(
     for surface, rotation, origin in surface_frames(system):
         limits = np.minimum(surface.half, 1e4)  # m away: as good as no edge
         corners = np.array([[i, j] for i in (-1, 1) for j in (-1, 1)]).T * limits[:, None]
-        reach = np.where(np.isfinite(surface.half), limits, 0.0)
-        depths = {0.0, float(np.nan_to_num(surface.sag(*reach)))}
+        depths = {0.0, surface.depth(surface.half)}
         points = np.concatenate([np.vstack([corners, np.full(4, z)]) for z in depths], axis=1)
         points = rotation @ points + origin[:, None]
         ahead = points[2] + distance
-        if ahead.min() <= 0:
+        bounded = np.isfinite(surface.half)
+        if ahead.min() > 0:
+            on_plane = source[:2, None] + (points[:2] - source[:2, None]) * (distance / ahead)
+            low = np.where(bounded, np.maximum(low, on_plane.min(axis=1)), low)
+            high = np.where(bounded, np.minimum(high, on_plane.max(axis=1)), high)
+        elif bounded.all():  # an endless one that is tilted reaches past any source
             raise ValueError(
                 f"distance of the source = {distance:g} mm: it stands within the depth of the "
                 "front surface; sources are before the lenses"
             )
-        on_plane = source[:2, None] + (points[:2] - source[:2, None]) * (distance / ahead)
-        bounded = np.isfinite(surface.half)
-        low = np.where(bounded, np.maximum(low, on_plane.min(axis=1)), low)
-        high = np.where(bounded, np.minimum(high, on_plane.max(axis=1)), high)
         if not surface.screen:
             break
     if not np.isfinite([low, high]).all():

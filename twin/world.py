@@ -1,13 +1,14 @@
 """The room around the prototype: LEDs, where the tracker is, ambient light.
 
 Room frame, mm: x along the line of LEDs, y away from it toward the tracker, z up from the tracker's
-height. `World.rates` is the one place where light becomes electrons; the camera is paraxial.
+height. `World.rates` is the one place where light becomes electrons; rays are exact.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +16,7 @@ import numpy as np
 from acquisition.frames import CHANNELS
 from raytransfer import TCD1304, OpticalSystem, prototype_head
 from raytransfer import _checks as check
-from raytransfer.illumination import pixel_solid_angles
+from raytransfer.irradiance import LightTable, photon_energy, pixel_response
 from raytransfer.studies import room_to_optical
 
 if TYPE_CHECKING:
@@ -25,8 +26,6 @@ if TYPE_CHECKING:
 
     from raytransfer import LineSensor
 
-PLANCK = 6.62607015e-34  # J s
-SPEED_OF_LIGHT = 299792458.0  # m/s
 LUMINOUS_EFFICACY = 683.0  # lm/W at 555 nm
 
 
@@ -41,8 +40,8 @@ class Led:
     position : tuple of float
         Room x, y and z, mm.
     power : float
-        Radiant power while lit, W. The thesis names none; 0.25 W leaves some 36,000 electrons in
-        a pixel in 25 µs from 1.3 m.
+        Radiant power while lit, W. The thesis names none; 0.04 W leaves some 42,000 electrons in
+        the brightest pixel, a caustic, in 25 µs from 1.3 m.
     wavelength : float
         µm.
     facing : float
@@ -51,7 +50,7 @@ class Led:
 
     channel: int
     position: tuple[float, float, float]
-    power: float = 0.25
+    power: float = 0.04
     wavelength: float = 0.63
     facing: float = 0.0
 
@@ -161,8 +160,12 @@ class World:
         """
         rates = np.zeros((CHANNELS, self.sensor.pixels))
         pose = self.pose(seconds)
+        solid_angles = _from_table if self.moving else _traced
         for led in self.leds:
-            angles = pixel_solid_angles(self.head, self.seen_from(led, pose), self.sensor)
+            place = self.seen_from(led, pose)
+            if place[2] <= 0:
+                continue  # behind the tracker
+            angles = solid_angles(self.head, self.sensor, led.wavelength, place)
             power = led.intensity(pose.x, pose.y, 0.0) * angles
             rates[led.channel] = power * self._electrons_per_joule(led.wavelength)
         return rates
@@ -170,5 +173,21 @@ class World:
     def _electrons_per_joule(self, wavelength: float) -> float:
         response = self.sensor.response
         assert response is not None  # noqa: S101  # refused by __post_init__
-        photon = PLANCK * SPEED_OF_LIGHT / (wavelength * 1e-6)
-        return float(response.quantum_efficiency(wavelength)) / photon
+        return float(response.quantum_efficiency(wavelength) / photon_energy(wavelength))
+
+
+def _traced(
+    head: OpticalSystem, sensor: LineSensor, wavelength: float, place: tuple[float, float, float]
+) -> NDArray[np.float64]:
+    return pixel_response(head, place, sensor, wavelength=wavelength)
+
+
+def _from_table(
+    head: OpticalSystem, sensor: LineSensor, wavelength: float, place: tuple[float, float, float]
+) -> NDArray[np.float64]:
+    return _table(head, sensor, wavelength).solid_angles(place)
+
+
+@lru_cache(maxsize=8)
+def _table(head: OpticalSystem, sensor: LineSensor, wavelength: float) -> LightTable:
+    return LightTable(head, sensor, wavelength=wavelength)
