@@ -153,7 +153,7 @@ def irradiance(
     on_pixels = np.zeros(sensor.pixels)
     account = 0.0
     for wavelength, share in zip(*emitter.spectrum.samples(wavelengths), strict=True):
-        for place, part in _disc(check_source(position), emitter.extent):
+        for place, part in disc(check_source(position), emitter.extent):
             pixels, losses = _illuminate(
                 system, place, sensor, wavelength, rays, threads, table, axis
             )
@@ -203,10 +203,10 @@ def pixel_budget(
     return _budget(system, pixels, account)
 
 
-def _disc(
+def disc(
     position: tuple[float, float, float], extent: float
 ) -> list[tuple[tuple[float, float, float], float]]:
-    """Points that stand for a disc, and their shares."""
+    """Points along the line that stand for a disc of a diameter in mm, and their shares."""
     if extent == 0:
         return [(position, 1.0)]
     # Gauss and Chebyshev's second rule: its weight is a disc's chord

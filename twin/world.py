@@ -16,7 +16,7 @@ import numpy as np
 from acquisition.frames import CHANNELS
 from raytransfer import TCD1304, OpticalSystem, prototype_head
 from raytransfer import _checks as check
-from raytransfer.irradiance import LightTable, photon_energy, pixel_response
+from raytransfer.irradiance import LightTable, disc, photon_energy, pixel_response
 from raytransfer.studies import room_to_optical
 
 if TYPE_CHECKING:
@@ -46,6 +46,8 @@ class Led:
         µm.
     facing : float
         Direction in which it shines, rad, counter-clockwise from +y.
+    extent : float
+        Diameter of what shines, mm; 0 is a point.
     """
 
     channel: int
@@ -53,6 +55,7 @@ class Led:
     power: float = 0.04
     wavelength: float = 0.63
     facing: float = 0.0
+    extent: float = 0.0
 
     def __post_init__(self) -> None:
         if not 0 <= self.channel < CHANNELS:
@@ -66,6 +69,7 @@ class Led:
         if self.wavelength > 20:
             raise ValueError(f"wavelength = {self.wavelength:g} µm: was it given in nm?")
         check.number("facing", self.facing)
+        check.not_negative("extent", self.extent, "a diameter in mm")
 
     def intensity(self, x: float, y: float, z: float) -> float:
         """Radiant intensity in W/sr toward a point of the room in mm."""
@@ -165,9 +169,11 @@ class World:
             place = self.seen_from(led, pose)
             if place[2] <= 0:
                 continue  # behind the tracker
-            angles = solid_angles(self.head, self.sensor, led.wavelength, place)
-            power = led.intensity(pose.x, pose.y, 0.0) * angles
-            rates[led.channel] = power * self._electrons_per_joule(led.wavelength)
+            intensity = led.intensity(pose.x, pose.y, 0.0)
+            rate = intensity * self._electrons_per_joule(led.wavelength)
+            for point, share in disc(place, led.extent):
+                angles = solid_angles(self.head, self.sensor, led.wavelength, point)
+                rates[led.channel] += rate * share * angles
         return rates
 
     def _electrons_per_joule(self, wavelength: float) -> float:

@@ -53,6 +53,23 @@ def test_turning_left_moves_the_spike_as_an_led_to_the_right_does() -> None:
     assert np.sign(moved) == -np.sign(after - before)  # inverted image
 
 
+def test_an_led_that_is_not_a_point_is_blurred() -> None:
+    """2 mm are 5.5 px from 1.3 m; the light in all stays the same."""
+    point, wide = (World(leds=[Led(0, (0, 0, 0), extent=e)]).rates()[0] for e in (0.0, 2.0))
+    assert wide.sum() == pytest.approx(point.sum(), rel=1e-3)
+    assert wide.max() < 0.8 * point.max()
+
+
+def test_the_table_and_the_trace_give_the_same_light() -> None:
+    """The former for a tracker that moves, the latter for one that stands."""
+    pose = Pose(100, 1500)
+    still, moving = World(tracker=pose).rates()[:2], World(tracker=lambda _: pose).rates()[:2]
+    assert not np.array_equal(still, moving)
+    difference = (moving - still)[still > 0]
+    assert np.sqrt(np.mean(difference**2)) < 0.01 * still.max()
+    assert moving.sum(axis=1) == pytest.approx(still.sum(axis=1), rel=2e-3)
+
+
 def test_a_trajectory_is_followed() -> None:
     world = World(tracker=lambda seconds: Pose(100 * seconds, 1300))
     assert world.moving
@@ -68,6 +85,7 @@ def test_a_trajectory_is_followed() -> None:
         (lambda: Led(0, (0, np.nan, 0)), "finite"),
         (lambda: Led(0, (0, 0, 0), power=-1), "power"),
         (lambda: Led(0, (0, 0, 0), wavelength=630), "given in nm"),
+        (lambda: Led(0, (0, 0, 0), extent=-1), "extent"),
         (lambda: World(leds=[*two_leds(), *two_leds()]), "each may be used once"),
         (lambda: World(ambient=-1), "ambient"),
         (lambda: Pose(0, np.inf), "finite"),
