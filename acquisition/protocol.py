@@ -221,7 +221,8 @@ class Command:
     def _checked_sequence(self) -> tuple[dict[int, int], ...]:
         if self.mode is Mode.ORIGINAL:
             return ()
-        given = self.sequence if len(self.sequence) else [{n: self.sh_period} for n in LAST_TWO]
+        longest = min(self.sh_period, _CONTINUES - 1)
+        given = self.sequence if len(self.sequence) else [{n: longest} for n in LAST_TWO]
         result = tuple(_checked_exposures(n, lit, self.sh_period) for n, lit in enumerate(given))
         entries = sum(len(_steps(lit)) for lit in result)
         if entries > TABLE_MAX:

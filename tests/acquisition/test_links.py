@@ -227,7 +227,7 @@ def test_polling_where_there_are_no_edges(
     with caplog.at_level(logging.INFO):
         link = SpiLink()
     assert "polling" in caplog.text
-    assert not link.wait_ready(0.003)
+    assert not link.wait_ready(0.05)
     assert gpio.looks > 2
     gpio.level = 1
     assert link.wait_ready(0)

@@ -85,6 +85,12 @@ def test_checksum_needs_words() -> None:
 # --- commands
 
 
+def test_the_longest_sh_period_has_a_default_sequence() -> None:
+    longest = Command(2**31, 2**31, 2, Mode.STREAM)
+    assert [set(lit.values()) for lit in longest.sequence] == [{2**31 - 1}] * 2
+    assert Command.decode(longest.encode()) == longest
+
+
 @st.composite
 def periods(draw: st.DrawFn) -> tuple[int, int]:
     sh = draw(st.one_of(st.integers(SH_MIN, 200), st.integers(SH_MIN, 2**31)))
