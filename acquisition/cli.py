@@ -205,7 +205,8 @@ Argument = Annotated[
     typer.Argument(
         metavar="FILE",
         show_default=False,
-        help="For --link replay: the recording. For spi: the device, such as 0.0.",
+        help="For --link replay: the recording. For spi: the device, such as 0.0. For twin: the lens "
+        "head, a design file or the name of one that comes along.",
     ),
 ]
 Leds = Annotated[

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -10,6 +11,7 @@ import numpy as np
 
 from acquisition.frames import CHANNELS
 from acquisition.links import LinkError, LinkUnavailable
+from raytransfer.designs import DESIGNS, Design, design_text, load_design
 from twin.machine import CLOCK, Machine
 from twin.sensor import Electronics, SensorModel
 from twin.world import World
@@ -114,14 +116,9 @@ class TwinLink:
 
     @property
     def lens_system(self) -> dict[str, object]:
-        """The head in front of the sensor, for a session's metadata; mm."""
-        head = self.world.head
-        return {
-            "name": head.name,
-            "elements": [element.part for element in head.elements],
-            "gaps": list(head.gaps),
-            "sensor_distance": head.sensor_distance,
-        }
+        """The head in front of the sensor as its design file has it, for a session's metadata."""
+        text = design_text(Design(self.world.head, self.world.sensor))
+        return {"name": self.world.head.name, "description": tomllib.loads(text)}
 
     def wait_ready(self, timeout: float) -> bool:
         """Whether the handshake line is high now or within `timeout` virtual seconds."""
@@ -163,9 +160,23 @@ class TwinLink:
 
 
 def open_twin(argument: str | None = None, **options: Any) -> TwinLink:
-    """Open the twin for ``--link twin``; it takes no argument."""
+    """Open the twin for ``--link twin``.
+
+    Parameters
+    ----------
+    argument : str, optional
+        The lens head: a design file, or the name of one of `DESIGNS`; the thesis's when left out.
+    **options
+        For `TwinLink`, without a world if there is an argument.
+    """
     if argument is not None:
-        raise ValueError(f"--link twin takes no argument, not {argument!r}")
+        if argument not in DESIGNS and not Path(argument).is_file():
+            raise LinkUnavailable(
+                f"--link twin {argument}: neither a design file nor one of the designs "
+                f"{', '.join(DESIGNS)}"
+            )
+        design = DESIGNS[argument] if argument in DESIGNS else load_design(argument)
+        options["world"] = World(head=design.system, sensor=design.sensor)
     try:
         return TwinLink(**options)
     except (FileNotFoundError, ImportError) as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,10 +15,13 @@ import pytest
 
 from acquisition.capture import Capture, Refused, capture
 from acquisition.dat import read_dat
+from acquisition.links import LinkUnavailable
 from acquisition.protocol import Command, CommandError, Mode
 from acquisition.session import open_session
+from raytransfer import Aperture
+from raytransfer.designs import save_design
 from raytransfer.irradiance import pixel_response
-from twin.link import TwinLink, firmware_image
+from twin.link import TwinLink, firmware_image, open_twin
 from twin.machine import CLOCK
 from twin.sensor import Electronics
 from twin.world import Led, Pose, World
@@ -334,3 +338,39 @@ def test_both_compilers_give_the_same_frames(tmp_path: Path) -> None:
             # interrupts take some cycles more or less: of 25 us or more of light, not 4 %
             depth = np.median(one) - np.array([one[~dark].mean(), two[~dark].mean()])
             assert depth[1] / depth[0] == pytest.approx(1, abs=0.04)
+
+
+def test_a_design_file_is_the_twins_head(tmp_path: Path) -> None:
+    """Its spikes are seen, and the session keeps all of it."""
+    thesis = World().head
+    slit = Aperture("slit", x=5.0)
+    head = replace(thesis, elements=(slit, *thesis.elements), gaps=(8.0, *thesis.gaps))
+    save_design(head, tmp_path / "slit.toml", notes="a narrow one")
+    options = "-i 20000 -s 100 -n 4 -o slit.h5 --stream".split()
+    run("capture", "--link", "twin", "slit.toml", *options, folder=tmp_path)
+    world = World(head=head)
+    with open_session(tmp_path / "slit.h5") as session:
+        for frame in session:
+            assert_spike(frame, world, frame.leds.bit_length() - 1)
+        kept = session.metadata.lens_system
+    assert kept["name"] == head.name
+    entries = [entry["part"] for entry in kept["description"]["element"] if "part" in entry]
+    assert entries[:2] == ["slit", "PCV_15_30_20"]
+
+
+def test_heads_by_name_and_heads_that_are_none(tmp_path: Path) -> None:
+    with open_twin("thesis") as link:
+        assert link.world.head == World().head
+    with pytest.raises(LinkUnavailable, match=r"no_such.toml: neither .* thesis"):
+        open_twin("no_such.toml")
+    (tmp_path / "bad.toml").write_text("version = 1")
+    failed = subprocess.run(
+        [LINETRACK, "capture", "--link", "twin", "bad.toml"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert failed.returncode in (1, 2)
+    assert "bad.toml" in failed.stderr
+    assert "Traceback" not in failed.stderr
