@@ -235,8 +235,13 @@ def front_opening(
     x, y, distance = check_source(position)
     source = np.array([x, y, -distance])
     low, high = np.full(2, -np.inf), np.full(2, np.inf)
-    for surface, rotation, origin in surface_frames(system):
-        limits = np.minimum(surface.half, 1e4)  # m away: as good as no edge
+    frames = surface_frames(system)
+    glass, _, place = next((f for f in frames if not f[0].screen), frames[-1])
+    # where a screen has no edge, light that reaches the first glass passes within
+    slope = (np.abs(source[:2]) + np.minimum(glass.half, 1e4)) / distance
+    within = np.minimum(glass.half, 1e4) + 2 * slope * (abs(place[2]) + 10) + 1
+    for surface, rotation, origin in frames:
+        limits = np.minimum(surface.half, within)
         corners = np.array([[i, j] for i in (-1, 1) for j in (-1, 1)]).T * limits[:, None]
         depths = {0.0, surface.depth(surface.half)}
         points = np.concatenate([np.vstack([corners, np.full(4, z)]) for z in depths], axis=1)
