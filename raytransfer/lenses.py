@@ -171,7 +171,7 @@ class SphericalLens:
         check_material(self.part, self.material)
         for name in ("front_radius", "back_radius"):
             radius = getattr(self, name)
-            if math.isinf(radius):
+            if radius in (math.inf, -math.inf):
                 continue
             check.radius(f"{name} of {self.part}", radius)
             if abs(radius) < self.diameter / 2:
@@ -179,7 +179,7 @@ class SphericalLens:
                     f"{name} of {self.part} = {radius:g} mm: |radius| is at least half the "
                     f"diameter ({self.diameter / 2:g} mm)"
                 )
-        if self.edge_thickness < 0:
+        if self.edge_thickness < -1e-9:  # a whole ball's is 0, but for rounding
             raise ValueError(
                 f"centre_thickness of {self.part} = {self.centre_thickness:g} mm: the sides cross "
                 f"before the edge, which would be {self.edge_thickness:.4g} mm thick"
@@ -293,6 +293,11 @@ class Lens:
         if self.clear is None:
             return
         object.__setattr__(self, "clear", tuple(self.clear))
+        if len(self.clear) != 2:
+            raise ValueError(
+                f"clear of {self.part} = {self.clear}: two sizes are needed, (across, along) the "
+                "axis of the cylinder, mm"
+            )
         for name, clear in zip(("height", "length"), self.clear, strict=True):
             size = getattr(self, name)
             if check.positive(f"clear {name} of {self.part}", clear, "a size in mm") > size:

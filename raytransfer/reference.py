@@ -12,7 +12,7 @@ import numpy as np
 
 from raytransfer.materials import D_LINE
 from raytransfer.prescription import prescription
-from raytransfer.tracing import Status, Trace, checked_rays
+from raytransfer.tracing import TINY, Status, Trace, checked_rays
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -34,10 +34,10 @@ def trace(
 ) -> Trace:
     """Trace rays; parameters, result and refusals are those of `tracing.trace`."""
     q, d = checked_rays(system, position, direction)
-    for step in _follow(system, q, d, wavelength, fresnel):
-        q, d, weight, lost = step
-    out = np.stack([q[0], q[1], *d, weight])
-    out[:, lost != 0] *= np.array([0, 0, 1, 1, 1, 0])[:, None]
+    with np.errstate(all="ignore"):  # lost rays are followed too, wherever that leads
+        for step in _follow(system, q, d, wavelength, fresnel):
+            q, d, weight, lost = step
+    out = np.where(lost == 0, np.stack([q[0], q[1], *d, weight]), 0.0)
     return Trace.of(out, lost)
 
 
@@ -62,14 +62,15 @@ def path(
     points = [q]
     steps = prescription(system, wavelength).steps
     follow = _follow(system, q, d, wavelength, fresnel=False)
-    for step, (local, _, _, lost) in zip(steps, follow, strict=True):
-        # q' = A q + b, and the frame's own axes are the columns of the product of all Aᵀ
-        rotation = rotation @ step[:, :3].T
-        origin = origin - rotation @ step[:, 3]
-        here = rotation @ local + origin[:, None]
-        ended = (lost != 0) & ((lost >> 2) < len(points) - 1)
-        ended |= (lost & 3 == Status.MISSED) & (lost >> 2 == len(points) - 1)
-        points.append(np.where(ended, points[-1], here))
+    with np.errstate(all="ignore"):
+        for step, (local, _, _, lost) in zip(steps, follow, strict=True):
+            # q' = A q + b, and the frame's own axes are the columns of the product of all Aᵀ
+            rotation = rotation @ step[:, :3].T
+            origin = origin - rotation @ step[:, 3]
+            here = rotation @ local + origin[:, None]
+            ended = (lost != 0) & ((lost >> 2) < len(points) - 1)
+            ended |= (lost & 3 == Status.MISSED) & (lost >> 2 == len(points) - 1)
+            points.append(np.where(ended, points[-1], here))
     return np.stack(points)
 
 
@@ -85,8 +86,7 @@ def _follow(
         q, d = step[:, :3] @ q + step[:, 3:], step[:, :3] @ d
         here = np.int16(4 * k)
         if k == len(parts.shapes):
-            ahead = d[2] > 0
-            q = q - d * (q[2] / np.where(ahead, d[2], 1.0))
+            q, _, ahead = _plane(q, d)
             lost = np.where((lost == 0) & ~ahead, here + np.int16(Status.MISSED), lost)
             yield q, d, weight, lost
             return
@@ -116,7 +116,7 @@ def _follow(
 
 
 def _plane(q: Array, d: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-    ahead = d[2] > 0
+    ahead = d[2] > TINY
     q = q - d * (q[2] / np.where(ahead, d[2], 1.0))
     normal = np.zeros_like(q)
     normal[2] = 1.0
@@ -127,11 +127,14 @@ def _curved(
     q: Array, d: Array, radius: float, meridians: Array
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Intersect with the near side of a cylinder or sphere whose vertex is at 0."""
-    q, _, _ = _plane(q, d)  # a distant source costs digits
     curved = np.array([*meridians, 1.0])[:, None]
+    centre = np.array([[0.0], [0.0], [radius]])
+    # seen from outside it must be ahead; seen from inside there is always a way out
+    ahead = (radius < 0) | ((curved * (q - centre) * d).sum(axis=0) < 0)
+    q, _, _ = _plane(q, d)  # a distant source costs digits
     across = curved * d  # what of the direction is across the axis
     square = (across**2).sum(axis=0)
-    from_centre = curved * (q - np.array([[0.0], [0.0], [radius]]))
+    from_centre = curved * (q - centre)
     to_foot = -(from_centre * d).sum(axis=0) / np.where(square > 0, square, 1.0)
     foot = from_centre + to_foot * across
     beside = radius**2 - (foot**2).sum(axis=0)
@@ -139,8 +142,8 @@ def _curved(
     half_chord = np.sqrt(np.where(hit, beside / np.where(square > 0, square, 1.0), 0.0))
     length = to_foot - np.sign(radius) * half_chord
     q = q + length * d
-    normal = -curved * (q - np.array([[0.0], [0.0], [radius]])) / radius
-    return q, normal, hit & (normal[2] > 0) & ((normal * d).sum(axis=0) > 0)
+    normal = -curved * (q - centre) / radius
+    return q, normal, hit & ahead & (normal[2] > 0) & ((normal * d).sum(axis=0) > 0)
 
 
 def _transmittance(n1: float, n2: float, cos1: Array, cos2: Array) -> Array:

@@ -65,12 +65,10 @@ class Surface:
         with np.errstate(invalid="ignore"):
             return np.asarray(squares / (1 + np.sqrt(root)))
 
-    @property
-    def depth(self) -> float:
-        """Depth behind the vertex at the edge of its opening, mm; 0 where that is not known."""
-        if self.round:
-            return float(self.sag(self.half[0], 0.0))
-        return float(self.sag(*(h if math.isfinite(h) else 0.0 for h in self.half)))
+    def depth(self, half: tuple[float, float]) -> float:
+        """Depth behind the vertex at the edge of that half size, mm; without an edge 0."""
+        x, y = (size if math.isfinite(size) else 0.0 for size in half)
+        return float(self.sag(x, 0.0 if self.round else y))
 
     def opens(self, x: Any, y: Any) -> NDArray[np.bool_]:
         """Whether points lie within the opening."""

@@ -161,6 +161,9 @@ class OpticalSystem:
             )
         if self.sensor_distance is not None:
             check.not_negative("sensor_distance", self.sensor_distance)
+        for placement in (*self.placements, self.sensor_placement):
+            if not isinstance(placement, Placement):
+                raise TypeError(f"{self.name}: {placement!r} is no Placement(decentre, tilt)")
         if self.placements and len(self.placements) != len(self.elements):
             raise ValueError(
                 f"{self.name}: {len(self.placements)} placements for {len(self.elements)} elements; "

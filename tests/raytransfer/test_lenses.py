@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from raytransfer import CATALOGUE, MATERIALS, THESIS_LENSES, ConstantIndex, Lens, Plate
+from raytransfer.lenses import Aperture, SphericalLens
 
 if TYPE_CHECKING:
     from raytransfer.lenses import Meridian
@@ -301,3 +302,195 @@ def test_wavelengths_in_nm_are_refused() -> None:
         lens.matrix("x", wavelength=587.6)
     with pytest.raises(ValueError, match="given in nm"):
         lens.focal_length(587.6)
+
+
+# --- clear aperture -------------------------------------------------------------------------
+
+
+def test_a_clear_aperture_closes_the_edges_but_not_the_glass() -> None:
+    lens = replace(PCX, clear=(26.0, 28.0))
+    assert (lens.aperture("x"), lens.aperture("y")) == (26, 28)
+    assert (lens.size("x"), lens.size("y")) == (30, 32)
+    assert lens.edge_thickness == PCX.edge_thickness
+    assert (PCX.aperture("x"), PCX.aperture("y")) == (30, 32)
+    assert_array_equal(np.asarray(lens.matrix("x")), np.asarray(PCX.matrix("x")))
+    for surface in lens.surfaces():
+        assert surface.half == (13, 14)
+    # (across, along) go with the lens
+    turned = lens.bending("y")
+    assert (turned.aperture("x"), turned.aperture("y")) == (28, 26)
+    assert [surface.half for surface in turned.turned().surfaces()] == [(14, 13)] * 2
+
+
+def test_a_clear_aperture_may_be_all_of_the_glass_and_a_list() -> None:
+    as_list: Any = [30, 32]
+    lens = replace(PCX, clear=as_list)
+    assert lens == replace(PCX, clear=(30, 32))
+    assert hash(lens) == hash(replace(PCX, clear=(30, 32)))
+
+
+@pytest.mark.parametrize(
+    ("clear", "name", "glass"), [((30.001, 10), "height", 30), ((10, 32.5), "length", 32)]
+)
+def test_clear_apertures_larger_than_the_glass_are_refused(
+    clear: tuple[float, float], name: str, glass: int
+) -> None:
+    with pytest.raises(ValueError, match=rf"the glass is {glass} mm; clear is \(across") as refusal:
+        replace(PCX, clear=clear)
+    wrong = clear[name == "length"]
+    assert str(refusal.value).startswith(f"clear {name} of PCX = {wrong:g} mm:")
+
+
+@pytest.mark.parametrize("bad", [0, -3, math.nan, math.inf])
+def test_clear_apertures_that_are_no_size_are_refused(bad: float) -> None:
+    with pytest.raises(ValueError, match=f"^clear height of PCX = {bad:g}: allowed"):
+        replace(PCX, clear=(bad, 10))
+    with pytest.raises(ValueError, match=f"^clear length of PCX = {bad:g}: allowed"):
+        replace(PCX, clear=(10, bad))
+
+
+@pytest.mark.parametrize("bad", [(10.0,), (10.0, 10.0, 10.0), ()])
+def test_clear_apertures_of_another_number_are_refused(bad: Any) -> None:
+    with pytest.raises(ValueError, match=r"^clear of PCX = .*two sizes.*\(across, along\)"):
+        replace(PCX, clear=bad)
+
+
+# --- surfaces of the elements ---------------------------------------------------------------
+
+
+@settings(deadline=None)
+@given(lenses)
+def test_surfaces_are_the_lens(lens: Lens) -> None:
+    front, back = lens.surfaces()
+    assert (front.z, back.z) == (0, lens.thickness)
+    assert (front.material, back.material) == (lens.material, None)
+    curved, plane = (back, front) if lens.reversed else (front, back)
+    assert plane.curvature == 0
+    assert curved.bends == lens.bends
+    at = np.array([-5.0, 2.0, 4.9])
+    x, y = (at, 0 * at) if lens.bends == "x" else (0 * at, at)
+    depth = [lens.sag(height) for height in at]
+    # a convex side retreats into the glass from its vertex, whichever way it looks
+    assert_allclose(curved.sag(x, y), np.multiply(depth, -1 if lens.reversed else 1), atol=1e-10)
+    assert_array_equal(curved.sag(y, x), 0)
+    # as seen from behind
+    for seen, here in zip(lens.turned().surfaces(), (back, front), strict=True):
+        assert seen.curvature == -here.curvature
+        assert seen.z == pytest.approx(lens.thickness - here.z, abs=1e-12)
+
+
+# --- screens --------------------------------------------------------------------------------
+
+
+def test_a_screen_is_thin_and_bends_nothing() -> None:
+    slit = Aperture("slit", x=5.0)
+    assert slit.thickness == 0
+    for meridian, opening in (("x", 5.0), ("y", math.inf)):
+        m: Any = meridian
+        assert_array_equal(np.asarray(slit.matrix(m, plates=False, wavelength=0.45)), np.eye(2))
+        assert slit.aperture(m) == opening
+        assert slit.size(m) == math.inf
+    (surface,) = slit.surfaces()
+    assert surface.screen
+    assert (surface.half, surface.material, surface.curvature) == ((2.5, math.inf), None, 0)
+    assert slit.turned() == slit
+    assert Aperture("open").aperture("x") == math.inf
+
+
+@pytest.mark.parametrize("name", ["x", "y"])
+@pytest.mark.parametrize("bad", [0, -5, math.nan, -math.inf])
+def test_openings_that_are_no_width_are_refused(name: str, bad: float) -> None:
+    with pytest.raises(ValueError, match=f"^{name} of slit = {bad:g}:") as refusal:
+        Aperture("slit", **{name: bad})
+    assert "full width" in str(refusal.value) or "finite" in str(refusal.value)
+
+
+@pytest.mark.parametrize("bad", [True, "5", None, [5.0]])
+def test_openings_that_are_no_number_are_refused(bad: Any) -> None:
+    with pytest.raises(TypeError) as refusal:
+        Aperture("slit", x=bad)
+    assert str(refusal.value).startswith(f"x of slit = {bad!r}:")
+
+
+# --- round lenses ---------------------------------------------------------------------------
+
+ROUND = SphericalLens("ball", 20.0, 15.0, -40.0, 8.0, GLASS)
+
+
+@pytest.mark.parametrize("meridian", ["x", "y"])
+def test_a_round_lens_is_the_lens_makers(meridian: Meridian) -> None:
+    """1/f = (n − 1) (1/R1 − 1/R2 + (n − 1) t/(n R1 R2)), in both meridians."""
+    for lens in (ROUND, replace(ROUND, front_radius=-30.0), replace(ROUND, back_radius=25.0)):
+        n, t, r1, r2 = 1.52, lens.thickness, lens.front_radius, lens.back_radius
+        power = (n - 1) * (1 / r1 - 1 / r2 + (n - 1) * t / (n * r1 * r2))
+        m = lens.matrix(meridian)
+        assert_allclose(m.C, -power, rtol=1e-12)
+        assert_allclose([m.A, m.D], [1 - (n - 1) * t / (n * r1), 1 + (n - 1) * t / (n * r2)])
+        assert_allclose(m.B, t / n, rtol=1e-14)
+        back = lens.turned().matrix(meridian)
+        assert_allclose(np.asarray(back), [[m.D, m.B], [m.C, m.A]], rtol=1e-12)
+    assert ROUND.size(meridian) == ROUND.aperture(meridian) == 20
+
+
+def test_a_round_lens_with_plane_sides_is_a_plate() -> None:
+    lens = SphericalLens("disc", 20.0, math.inf, -math.inf, 3.0, GLASS)
+    assert_allclose(np.asarray(lens.matrix("x")), [[1.0, 3 / 1.52], [0.0, 1.0]], rtol=1e-14)
+    assert lens.edge_thickness == 3
+    assert [surface.curvature for surface in lens.surfaces()] == [0, 0]
+    assert all(surface.round for surface in lens.surfaces())
+
+
+def test_edges_of_round_lenses() -> None:
+    front, back = 15 - math.sqrt(15**2 - 100), 40 - math.sqrt(40**2 - 100)
+    assert ROUND.edge_thickness == pytest.approx(8 - front - back, rel=1e-12)
+    meniscus = replace(ROUND, front_radius=15.0, back_radius=20.0)
+    assert meniscus.edge_thickness == pytest.approx(8 - front + 20 - math.sqrt(300), rel=1e-12)
+    assert ROUND.turned().turned() == ROUND
+    assert ROUND.turned().edge_thickness == pytest.approx(ROUND.edge_thickness, rel=1e-12)
+
+
+@pytest.mark.parametrize("radius", [15.0, 23.25, 24.75, 30.75, 49.0])
+def test_a_whole_ball_is_a_lens(radius: float) -> None:
+    """Its edge is 0 thick, also where 1/R is rounded up."""
+    ball = SphericalLens("ball", 2 * radius, radius, -radius, 2 * radius, GLASS)
+    assert ball.edge_thickness == pytest.approx(0, abs=1e-12)
+    n = 1.52
+    assert_allclose(ball.matrix("x").C, -2 * (n - 1) / (n * radius), rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["diameter", "centre_thickness"])
+@pytest.mark.parametrize("bad", [math.nan, math.inf, 0, -5.9])
+def test_round_sizes_that_are_not_positive_are_refused(name: str, bad: float) -> None:
+    change: Any = {name: bad}
+    with pytest.raises(ValueError, match=f"^{name} of ball = {bad:g}: allowed"):
+        replace(ROUND, **change)
+
+
+@pytest.mark.parametrize("name", ["front_radius", "back_radius"])
+def test_round_radii_that_are_none_are_refused(name: str) -> None:
+    for bad in (0, math.nan):
+        change: Any = {name: bad}
+        with pytest.raises(ValueError, match=f"^{name} of ball = {bad:g}"):
+            replace(ROUND, **change)
+    for bad in (9.99, -9.99):
+        change = {name: bad}
+        with pytest.raises(ValueError, match=r"at least half the diameter \(10 mm\)") as refusal:
+            replace(ROUND, **change)
+        assert str(refusal.value).startswith(f"{name} of ball = {bad:g} mm")
+    wrong: Any = {name: "15"}
+    with pytest.raises(TypeError, match=f"^{name} of ball = '15'"):
+        replace(ROUND, **wrong)
+
+
+def test_round_lenses_whose_sides_cross_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"^centre_thickness of ball = 5 mm: the sides cross"):
+        replace(ROUND, centre_thickness=5.0)  # 3.82 + 1.27 mm deep
+    assert replace(ROUND, centre_thickness=5.1).edge_thickness > 0
+
+
+@pytest.mark.parametrize("make", [lambda m: replace(ROUND, material=m), lambda m: Plate("p", 1, m)])
+@pytest.mark.parametrize("bad", [1.52, "N-BK7", None])
+def test_materials_that_are_none_are_refused(make: Any, bad: Any) -> None:
+    with pytest.raises(TypeError, match="take one of MATERIALS") as refusal:
+        make(bad)
+    assert f"= {bad!r}" in str(refusal.value)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
@@ -21,8 +22,11 @@ from PIL import Image
 
 from raytransfer import (
     CATALOGUE,
+    MATERIALS,
     TCD1304,
+    THESIS_LENSES,
     Lens,
+    OpticalSystem,
     Plate,
     cast_rays,
     collimating_pair,
@@ -30,6 +34,7 @@ from raytransfer import (
     prototype_head,
     telecentric_pair,
 )
+from raytransfer.lenses import Aperture, SphericalLens
 from raytransfer.studies import (
     beam_width,
     field_edge,
@@ -385,6 +390,100 @@ def test_a_sensor_can_be_put_anywhere(ax: Axes) -> None:
 def test_sources_without_a_distance_are_refused(bad: float, ax: Axes) -> None:
     with pytest.raises(ValueError, match=f"^source_dist = {bad:g}"):
         plots.plot_system(PAIR, "x", [(bad, 0)], ax)
+
+
+# --- screens and round lenses ---------------------------------------------------------------
+
+SLIT = Aperture("slit", x=5.0)
+WITH_SLIT = OpticalSystem("slit and pair", (SLIT, *PAIR.elements), (6.0, 0.0), 26.0)
+
+
+def screens(ax: Axes) -> list[NDArray[np.float64]]:
+    """End points of what is drawn black and thick, where it can be seen."""
+    lines = [line for line in ax.lines if line.get_color() == "k" and line.get_linewidth() == 2]
+    ends = [np.stack(data(line), axis=1) for line in lines]
+    return [end for end in ends if np.isfinite(end).all()]
+
+
+def test_a_screen_is_drawn_beside_its_opening(ax: Axes) -> None:
+    plots.plot_system(WITH_SLIT, "x", [(500, 0)], ax)
+    lower, upper = screens(ax)
+    assert_array_equal(lower[:, 0], 0)
+    assert_array_equal(upper[:, 0], 0)
+    assert (lower[0, 1], upper[0, 1]) == (-2.5, 2.5)
+    assert lower[1, 1] == -upper[1, 1] < -10
+    assert len(ax.patches) == 2  # no glass
+
+
+def test_a_screen_is_where_it_stands(ax: Axes) -> None:
+    behind = OpticalSystem("behind", (*PAIR.elements, SLIT), (0.0, 4.0), 20.0)
+    plots.plot_system(behind, "x", [(500, 0)], ax)
+    for side in screens(ax):
+        assert_allclose(side[:, 0], 2 * 5.9 + 4.0, rtol=1e-15)
+
+
+def test_a_screen_without_an_edge_in_this_meridian_hides_nothing(ax: Axes) -> None:
+    plots.plot_system(WITH_SLIT, "y", [(500, 0)], ax, rays=3, width=20.0)
+    assert screens(ax) == []
+    for line in ax.lines[:3]:
+        assert not np.isnan(data(line)[1]).any()
+    assert np.isfinite([ax.get_xlim(), ax.get_ylim()]).all()
+
+
+def test_a_screen_wider_than_the_window_is_drawn_too(ax: Axes) -> None:
+    wide = OpticalSystem("wide", (*PAIR.elements, Aperture("wide", x=50.0)), (0.0, 4.0), 20.0)
+    plots.plot_system(wide, "x", [(500, 0)], ax)
+    for side in screens(ax):
+        assert abs(side[0, 1]) == 25
+        assert abs(side[1, 1]) > 25
+
+
+def test_rays_end_at_a_screen(ax: Axes) -> None:
+    plots.plot_system(WITH_SLIT, "x", [(5000, 0)], ax, rays=5, width=8.0)
+    upper, inner, middle, _, lower = (data(line)[1] for line in ax.lines[:5])
+    for ray in (upper, lower):
+        assert abs(ray[1]) == 4  # up to the screen
+        assert np.isnan(ray[2:]).all()
+    for ray in (inner, middle):
+        assert not np.isnan(ray).any()
+
+
+def test_rays_fill_the_opening_of_a_screen_in_front(ax: Axes) -> None:
+    plots.plot_system(WITH_SLIT, "x", [(5000, 0)], ax)
+    first = [data(line)[1][1] for line in ax.lines[:9]]
+    assert (max(first), min(first)) == (2.5, -2.5)
+
+
+def test_rays_end_at_the_clear_aperture(ax: Axes) -> None:
+    lens = replace(THESIS_LENSES["PCX_30_32_60"], clear=(20.0, 24.0))
+    system = OpticalSystem("clear", (lens,), (), 20.0)
+    plots.plot_system(system, "x", [(5000, 0)], ax)
+    first = [data(line)[1][1] for line in ax.lines[:9]]
+    assert (max(first), min(first)) == (10, -10)
+    count = len(ax.lines)
+    plots.plot_system(system, "x", [(5000, 0)], ax, rays=3, width=21.0)
+    assert np.isnan(data(ax.lines[count])[1][2:]).all()
+    # the glass is drawn as far as it goes
+    (corners,) = {patch.get_xy()[:, 1].max() for patch in ax.patches if isinstance(patch, Polygon)}
+    assert corners == 15
+
+
+@pytest.mark.parametrize("meridian", ["x", "y"])
+@pytest.mark.parametrize("radius", [20.0, 24.75])
+def test_outline_of_a_round_lens_is_two_circles(meridian: Meridian, radius: float) -> None:
+    """Up to the whole ball, whose edge may not become nothing by rounding."""
+    diameter = 30.0 if radius == 20 else 2 * radius
+    lens = SphericalLens("round", diameter, radius, -radius, 2 * radius, MATERIALS["N-BK7"])
+    system = OpticalSystem("one", (Plate("plate", 1.0, MATERIALS["N-BK7"]), lens), (30.0,))
+    corners = plots.outline(system.layout()[1], meridian, 14.9)
+    assert np.isfinite(corners).all()
+    assert corners[:, 1].max() == -corners[:, 1].min() == diameter / 2
+    for side in (corners[:41], corners[41:]):
+        # both are about the middle of a symmetric ball
+        distance = np.hypot(side[:, 0] - (31.0 + radius), side[:, 1])
+        assert_allclose(distance, radius, rtol=1e-6)
+    assert corners[20, 0] == pytest.approx(31.0)
+    assert corners[61, 0] == pytest.approx(31.0 + 2 * radius)
 
 
 # --- tracking area --------------------------------------------------------------------------

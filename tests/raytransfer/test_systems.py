@@ -25,6 +25,8 @@ from raytransfer import (
     prototype_head,
     telecentric_pair,
 )
+from raytransfer.lenses import Aperture, SphericalLens
+from raytransfer.systems import Placement
 
 if TYPE_CHECKING:
     from raytransfer.lenses import Meridian
@@ -470,3 +472,258 @@ def test_lists_are_accepted_for_tuples() -> None:
     system = OpticalSystem("ours", elements, gaps)
     assert system == replace(system, elements=(PCX, PCX), gaps=(1.0,))
     assert hash(system) == hash(OpticalSystem("ours", (PCX, PCX), (1.0,)))
+
+
+# --- places ---------------------------------------------------------------------------------
+
+GLASS = MATERIALS["thesis glass"]
+PCV = THESIS_LENSES["PCV_15_30_20"]
+SLIT = Aperture("slit", x=5.0)
+
+
+def turn(axis: int, angle: float) -> np.ndarray[Any, Any]:
+    """Rodrigues: v cos + (k × v) sin + k (k · v) (1 − cos)."""
+    k = np.eye(3)[axis]
+    columns = [
+        v * math.cos(angle) + np.cross(k, v) * math.sin(angle) + k * (k @ v) * (1 - math.cos(angle))
+        for v in np.eye(3)
+    ]
+    return np.stack(columns, axis=1)
+
+
+def test_rotation_is_about_x_then_y_then_z() -> None:
+    tilt = (0.3, -0.4, 1.2)
+    expected = turn(2, tilt[2]) @ turn(1, tilt[1]) @ turn(0, tilt[0])
+    assert_allclose(Placement(tilt=tilt).rotation(), expected, rtol=1e-14, atol=1e-16)
+    # right-handed: about X, Y goes to Z
+    assert_allclose(Placement(tilt=(0.1, 0, 0)).rotation()[:, 1], [0, math.cos(0.1), math.sin(0.1)])
+    assert_array_equal(Placement().rotation(), np.eye(3))
+
+
+def test_places_are_the_layout_with_the_deviations() -> None:
+    placements = (
+        Placement(),
+        Placement((0.1, -0.2), (0.01, 0.02, 0.03)),
+        Placement((0.0, 0.3)),
+        Placement(),
+        Placement(tilt=(0, 0, 0.5)),
+    )
+    head = replace(prototype_head(), placements=placements, sensor_placement=Placement((0.05, 0.0)))
+    places = head.places()
+    assert len(places) == 6
+    for (rotation, origin), placement, placed in zip(
+        places, placements, head.layout(), strict=False
+    ):
+        assert_array_equal(rotation, placement.rotation())
+        assert_array_equal(origin, [*placement.decentre, placed.front])
+    assert_allclose(places[-1][1], [0.05, 0.0, 42.70 + 0.82], rtol=1e-14)
+    assert len(telecentric_pair().places()) == 2  # no sensor
+    # matrices know nothing of them
+    assert head.matrix("x") == prototype_head().matrix("x")
+    assert hash(head) != hash(prototype_head())
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+@pytest.mark.parametrize(("name", "length"), [("decentre", 2), ("tilt", 3)])
+def test_placements_that_are_not_finite_are_refused(name: str, length: int, bad: float) -> None:
+    for at in range(length):
+        values: Any = [0.0] * length
+        values[at] = bad
+        with pytest.raises(ValueError, match=rf"^{name}\[{at}\] = {bad}"):
+            Placement(**{name: values})
+    wrong: Any = {name: ["0.1"] * length}
+    with pytest.raises(TypeError, match=rf"^{name}\[0\] = '0.1'"):
+        Placement(**wrong)
+
+
+@pytest.mark.parametrize("bad", [(), (0.1,), (0.1, 0.2, 0.3, 0.4)])
+def test_placements_of_another_number_are_refused(bad: Any) -> None:
+    with pytest.raises(ValueError, match=r"^decentre = .*: 2 numbers are needed, mm in X and Y"):
+        Placement(decentre=bad)
+    with pytest.raises(ValueError, match=r"^tilt = .*: 3 numbers are needed, rad about X, Y, Z"):
+        Placement(tilt=bad)
+
+
+@pytest.mark.parametrize("tilt", [(math.pi / 2, 0, 0), (0, -2.0, 0), (5.0, 0, 0)])
+def test_tilts_in_degrees_are_refused(tilt: Any) -> None:
+    with pytest.raises(ValueError, match="given in degrees") as refusal:
+        Placement(tilt=tilt)
+    assert str(refusal.value).startswith(f"tilt = {tuple(map(float, tilt))}")
+    assert Placement(tilt=(0, 1.57, 90)).tilt == (0, 1.57, 90)  # about Z all angles are sensible
+
+
+def test_a_wrong_number_of_placements_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"1 placements for 5 elements; give one for each"):
+        replace(prototype_head(), placements=(Placement(),))
+
+
+# --- turned ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_turned_is_the_system_from_behind(name: str) -> None:
+    system = SYSTEMS[name]
+    back = system.turned()
+    assert back.sensor_distance is None
+    assert back.length == pytest.approx(system.length, rel=1e-15)
+    for meridian in ("x", "y"):
+        m = system.matrix(meridian)
+        seen = back.matrix(meridian)
+        assert_allclose(np.asarray(seen), [[m.D, m.B], [m.C, m.A]], rtol=1e-12, atol=1e-15)
+    assert back.turned().elements == system.elements
+    assert back.turned().gaps == system.gaps
+    assert back.name == f"{system.name}, turned"
+
+
+def test_displaced_elements_cannot_be_turned_but_a_sensor_can_be_left() -> None:
+    head = prototype_head()
+    moved = replace(head, placements=(Placement((0.1, 0.0)), *[Placement()] * 4))
+    with pytest.raises(ValueError, match="only a system of elements in their places"):
+        moved.turned()
+    nominal = replace(
+        head, placements=(Placement(),) * 5, sensor_placement=Placement(tilt=(0.1, 0, 0))
+    )
+    assert nominal.turned() == head.turned()
+
+
+# --- overlap --------------------------------------------------------------------------------
+
+
+def sag(radius: float, height: float) -> float:
+    return radius - math.sqrt(radius**2 - height**2)
+
+
+def least_gap(before: Any, after: Any, *, low: float = 0.0, high: float = 40.0) -> float:
+    """The smallest gap that is not refused."""
+    while high - low > 1e-10:
+        middle = (low + high) / 2
+        try:
+            OpticalSystem("gap", (before, after), (middle,))
+        except ValueError as refusal:
+            assert "overlap" in str(refusal)  # noqa: PT017
+            low = middle
+        else:
+            high = middle
+    return high
+
+
+def test_lenses_may_stand_as_close_as_their_glass_allows() -> None:
+    """The smallest gap is what the circles say, to 1e-8 mm."""
+    convex, hollow = PCX.turned(), replace(PCX, radius=-31.0)
+    deep = sag(31, 15)
+    cases: list[tuple[Any, Any, float]] = [
+        (convex, PCX, 0.0),  # curved sides touch in their vertices
+        (convex, hollow, 0.0),  # as ball and socket
+        (PCX, hollow, deep),  # a plane before a hollow: the edges meet
+        (hollow.turned(), PCX.turned(), deep),
+        (hollow.turned(), hollow, 2 * deep),
+        (hollow.turned(), PCX, 0.0),
+        (replace(convex, radius=60.0), hollow, deep - sag(60, 15)),
+        (replace(convex, radius=20.0, centre_thickness=7.0), hollow, 0.0),
+        (PCX, hollow.bending("y"), sag(31, 15)),  # 32 mm wide, 30 high
+        (convex, hollow.bending("y"), sag(31, 15)),  # crossed: its ends in the middle
+    ]
+    for before, after, expected in cases:
+        assert least_gap(before, after) == pytest.approx(expected, abs=1e-8)
+
+
+def test_only_the_smaller_one_of_the_two_can_touch() -> None:
+    small = Lens("small", 10, 10, 31, 5.9, GLASS).turned()
+    hollow = replace(PCX, radius=-31.0)
+    flat = small.turned()
+    assert least_gap(flat, hollow) == pytest.approx(sag(31, 5), abs=1e-8)
+    assert least_gap(hollow.turned(), small) == pytest.approx(sag(31, 5), abs=1e-8)
+
+
+def test_round_lenses_touch_on_a_circle_not_in_the_corners() -> None:
+    hollow = SphericalLens("hollow", 20.0, -15.0, math.inf, 3.0, GLASS)
+    flat = SphericalLens("flat", 20.0, math.inf, math.inf, 3.0, GLASS)
+    assert least_gap(flat, hollow) == pytest.approx(sag(15, 10), abs=1e-8)
+    assert least_gap(hollow.turned(), flat) == pytest.approx(sag(15, 10), abs=1e-8)
+    # a square lens of 20 mm has its corners outside the round one
+    square = Lens("square", 20, 20, 100, 5, GLASS)
+    assert least_gap(square, hollow) == pytest.approx(sag(15, 10), abs=1e-8)
+
+
+def test_screens_reach_to_the_edge_of_their_opening() -> None:
+    hollow = replace(PCX, radius=-31.0)
+    assert least_gap(SLIT, PCX) == 0 or least_gap(SLIT, PCX) < 1e-9  # before a convex side
+    assert least_gap(PCX.turned(), SLIT) < 1e-9
+    assert least_gap(SLIT, hollow) == pytest.approx(sag(31, 15), abs=1e-8)
+    assert least_gap(hollow.turned(), SLIT) == pytest.approx(sag(31, 15), abs=1e-8)
+    # one that is wider than the lens lets it in
+    assert least_gap(Aperture("wide", x=30.5, y=32.5), hollow) < 1e-9
+    assert least_gap(hollow.turned(), Aperture("open")) < 1e-9
+
+
+def test_tilts_and_decentres_need_room() -> None:
+    disc = SphericalLens("disc", 20.0, math.inf, math.inf, 3.0, GLASS)
+    tilted = (Placement(), Placement(tilt=(0.0, 0.1, 0.0)))
+    room = 10 * math.tan(0.1)  # the tilted front is met 10 mm from the axis
+    with pytest.raises(ValueError, match=r"disc and disc overlap by .* 0\.9 mm apart; is the gap"):
+        OpticalSystem("tilted", (disc, disc), (0.9,), placements=tilted)
+    OpticalSystem("tilted", (disc, disc), (room + 0.001,), placements=tilted)
+    # parallel, but the second one's vertex stays on the axis
+    room = 3 / math.cos(0.1) - 3
+    OpticalSystem("both", (disc, disc), (room + 1e-8,), placements=(tilted[1],) * 2)
+    with pytest.raises(ValueError, match="overlap"):
+        OpticalSystem("both", (disc, disc), (room - 1e-8,), placements=(tilted[1],) * 2)
+    # ball and socket fit only where they are centred
+    hollow, convex = replace(PCX, radius=-31.0), PCX.turned()
+    aside = (Placement(), Placement(decentre=(3.0, 0.0)))
+    OpticalSystem("fits", (convex, hollow), (0.0,))
+    with pytest.raises(ValueError, match="overlap"):
+        OpticalSystem("aside", (convex, hollow), (0.0,), placements=aside)
+    OpticalSystem(
+        "along", (convex, hollow), (0.0,), placements=(Placement(), Placement((0.0, 3.0)))
+    )
+
+
+def test_overlap_names_what_where_and_why() -> None:
+    hollow = replace(PCX, radius=-31.0, part="hollow")
+    with pytest.raises(ValueError, match="PCX_30_32_60 and hollow overlap") as refusal:
+        OpticalSystem("ours", (PCX, hollow), (1.5,))
+    message = str(refusal.value)
+    assert f"overlap by {sag(31, 15) - 1.5:.4g} mm" in message
+    assert "x = -15" in message or "x = 15" in message
+    assert "vertices are 1.5 mm apart; is the gap too small, or a lens the wrong way" in message
+
+
+def test_a_hollow_half_cylinder_is_as_deep_as_its_radius() -> None:
+    """Where 1/R is rounded up its edge must not be taken for no glass at all."""
+    for radius in (20.0, 23.25, 30.75, 49.0):
+        gutter = Lens("gutter", 2 * radius, 20, -radius, 2.0, GLASS)
+        flat = Lens("flat", 2 * radius, 20, 1000, 10, GLASS)
+        assert least_gap(flat, gutter, high=60) == pytest.approx(radius, abs=1e-8)
+
+
+def test_the_wrong_way_round_is_found_in_the_head() -> None:
+    head = prototype_head()
+    concave, first, second, convex, window = head.elements
+    for elements in [
+        (concave.turned(), first, second, convex, window),  # hollow toward the pair: 2.63 mm
+        (concave, replace(PCX, radius=-31.0), second, convex, window),  # hollow to a plane side
+    ]:
+        try:
+            OpticalSystem("head", elements, head.gaps, head.sensor_distance)
+        except ValueError as refusal:
+            assert "overlap" in str(refusal)  # noqa: PT017
+        else:
+            pytest.fail("accepted")
+    # and what fits is not refused
+    OpticalSystem("head", (concave, first, second, convex.turned(), window), head.gaps)
+    OpticalSystem("slit", (SLIT, *head.elements), (3.25, *head.gaps), head.sensor_distance)
+
+
+def test_what_is_no_element_is_refused() -> None:
+    wrong: Any = (PCX, "PCX_30_32_60")
+    with pytest.raises(TypeError, match=r"^ours: 'PCX_30_32_60' is no Lens, Plate or Aperture"):
+        OpticalSystem("ours", wrong, (1.0,))
+
+
+def test_what_is_no_placement_is_refused() -> None:
+    wrong: Any = ((0.1, 0.0),)
+    with pytest.raises(TypeError, match=r"^ours: .*\(0.1, 0.0\).*Placement"):
+        OpticalSystem("ours", (PCX,), placements=wrong)
+    with pytest.raises(TypeError, match=r"^ours: .*\(0.1, 0.0\).*Placement"):
+        OpticalSystem("ours", (PCX,), sensor_placement=wrong[0])
