@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from raytransfer import _checks as check
-from raytransfer.lenses import CATALOGUE, THESIS_LENSES, Element, Lens, Meridian
+from raytransfer.lenses import CATALOGUE, THESIS_LENSES, Aperture, Element, Lens, Meridian
 from raytransfer.materials import D_LINE
 from raytransfer.matrices import RayMatrix, trans_mat
 from raytransfer.sensors import TCD1304, LineSensor
@@ -175,7 +175,11 @@ class OpticalSystem:
         """Refuse elements that reach into each other, at any of 9 × 9 points within both."""
         places = self.places()
         layout = self.layout()
-        for number, (before, after) in enumerate(pairwise(self.elements)):
+        every = range(len(self.elements))
+        glass = [number for number in every if not isinstance(self.elements[number], Aperture)]
+        # neighbours, and glass that might meet through a screen's opening
+        for number, following in dict.fromkeys([*pairwise(every), *pairwise(glass)]):
+            before, after = self.elements[number], self.elements[following]
             back, front = before.surfaces()[-1], after.surfaces()[0]
             if not (back.bends or front.bends or self.placements):
                 continue  # parallel planes; gaps are ≥ 0
@@ -194,7 +198,7 @@ class OpticalSystem:
                 x, y = x[~back.opens(x, y)], y[~back.opens(x, y)]
             rotation, origin = places[number]
             points = rotation @ np.stack([x, y, back.z + back.sag(x, y)]) + origin[:, None]
-            rotation, origin = places[number + 1]
+            rotation, origin = places[following]
             x, y, z = rotation.T @ (points - origin[:, None])
             if front.screen:
                 solid = ~front.opens(x, y)
@@ -205,7 +209,7 @@ class OpticalSystem:
                 raise ValueError(
                     f"{before.part} and {after.part} overlap by {overlap[worst]:.4g} mm at "
                     f"x = {x[worst]:.4g}, y = {y[worst]:.4g} mm: their vertices are "
-                    f"{layout[number + 1].front - layout[number].back:g} mm apart; "
+                    f"{layout[following].front - layout[number].back:g} mm apart; "
                     "is the gap too small, or a lens the wrong way round?"
                 )
 

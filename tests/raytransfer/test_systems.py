@@ -727,3 +727,13 @@ def test_what_is_no_placement_is_refused() -> None:
         OpticalSystem("ours", (PCX,), placements=wrong)
     with pytest.raises(TypeError, match=r"^ours: .*\(0.1, 0.0\).*Placement"):
         OpticalSystem("ours", (PCX,), sensor_placement=wrong[0])
+
+
+def test_glass_does_not_reach_through_a_wide_screen_into_other_glass() -> None:
+    """Two hollow sides back to back touch at their edges, whatever is open between them."""
+    hollow = Lens("hollow", 20.0, 20.0, -20.0, 3.0, MATERIALS["N-BK7"])
+    wide = Aperture("wide open", 30.0, 30.0)
+    deep = 2 * abs(hollow.sag(10.0))
+    with pytest.raises(ValueError, match=r"hollow and hollow overlap by 0\.2 mm"):
+        OpticalSystem("close", (hollow.turned(), wide, hollow), (deep / 2 - 0.1, deep / 2 - 0.1))
+    OpticalSystem("apart", (hollow.turned(), wide, hollow), (deep / 2, deep / 2))
