@@ -13,9 +13,11 @@ from benchmarks.measure import Result, interleaved, ratios
 
 ROUNDS = 25
 
-# the explorer, and the same two-panel figure drawn anew by the inline backend at every move
+# the explorer, with exact rays as well, and the same two-panel figure drawn anew by the inline
+# backend at every move
 CELLS = (
     "%matplotlib inline\nfrom raytransfer.explorer import Explorer\nexplorer = Explorer()\nexplorer",
+    "Explorer(exact=True)",
     """
 import dataclasses
 import ipywidgets
@@ -65,7 +67,7 @@ WATCH = """
 
 
 def run() -> list[Result]:
-    """Press the arrow key in turns on the explorer and on the figure drawn anew."""
+    """Press the arrow key in turns on the explorers and on the figure drawn anew."""
     with tempfile.TemporaryDirectory() as folder:
         cells = [new_code_cell(source) for source in CELLS]
         kernel = {"name": "python3", "display_name": "Python 3", "language": "python"}
@@ -78,20 +80,24 @@ def run() -> list[Result]:
                 output.evaluate("(element, id) => { element.id = id; }", f"output-{number}")
 
             def move(description: str, output: str) -> float:
-                lab.slider(description).focus()
+                row = lab.page.locator(f"{output} .widget-slider", has_text=description)
+                row.locator(".noUi-handle").first.focus()
                 lab.page.evaluate(WATCH, [output])
                 lab.page.keyboard.press("ArrowRight")
                 took: float = lab.page.evaluate("() => window.newPixels")
                 lab.page.wait_for_timeout(100)  # let both come to rest
                 return took
 
-            blitted, anew = interleaved(
+            blitted, exact, anew = interleaved(
                 ROUNDS,
                 lambda: move("source (mm)", "#output-0"),
-                lambda: move("anew", "#output-1"),
+                lambda: move("source (mm)", "#output-1"),
+                lambda: move("anew", "#output-2"),
             )
     return [
         Result("slider: explorer, key press to new pixels", "ms", blitted, "lower"),
+        Result("slider: explorer with exact rays", "ms", exact, "lower"),
+        Result("slider: exact / paraxial", "", ratios(exact, blitted), "lower", 2),
         Result("slider: the same figure drawn anew by the inline backend", "ms", anew, "lower"),
         Result("slider: explorer / drawn anew", "", ratios(blitted, anew), "lower", 0.25),
     ]

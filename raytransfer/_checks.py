@@ -79,12 +79,17 @@ def radius(name: str, value: Any) -> float:
     return result
 
 
-def array(name: str, values: ArrayLike, hint: str = "") -> NDArray[np.float64]:
-    """Return the values as an array of finite floats, or refuse them."""
+def numbers(name: str, values: ArrayLike) -> NDArray[np.float64]:
+    """Return the values as an array of floats, or refuse what are no real numbers."""
     result = np.asarray(values)
     if result.dtype.kind not in "iuf":
         raise TypeError(f"{name}: real numbers are needed, not {result.dtype}")
-    result = result.astype(np.float64, copy=False)
+    return result.astype(np.float64, copy=False)
+
+
+def array(name: str, values: ArrayLike, hint: str = "") -> NDArray[np.float64]:
+    """Return the values as an array of finite floats, or refuse them."""
+    result = numbers(name, values)
     if not np.isfinite(result).all():
         first = result[~np.isfinite(result)].flat[0]
         raise ValueError(f"{name} = {first}: allowed are finite numbers{_because(hint)}")

@@ -1,9 +1,10 @@
 """Compiled ray tracing: bare arrays, no checks. `tracing` and `irradiance` stand on it.
 
 Rays are traced in blocks, surface by surface, each surface in a loop without branches that the
-compiler turns into vector instructions. A block is one flat array of eight rows at constant offsets,
-by which the compiler sees that they do not overlap. Every ray is computed on its own, in full blocks,
-so results do not depend on the number of threads.
+compiler turns into vector instructions: choices are made between values that are both there, and
+what is the same for all rays is decided when the loop is compiled. A block is one flat array of rows
+at constant offsets, by which the compiler sees that they do not overlap. Every ray is computed on its
+own, in full blocks, so results do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -12,8 +13,8 @@ import numpy as np
 from numba import njit, prange
 
 BLOCK = 1024
-X, Y, Z, DX, DY, DZ, W, LOST = (BLOCK * row for row in range(8))
-SIZE = 8 * BLOCK
+X, Y, Z, DX, DY, DZ, W, LOST, KEPT = (BLOCK * row for row in range(9))
+SIZE = 9 * BLOCK
 
 # as in tracing.Status; LOST holds 0 or 4 × surface + reason
 MISSED, BLOCKED, REFLECTED = 1.0, 2.0, 3.0
@@ -62,102 +63,109 @@ def _open(b, hx, hy, circle, code):
 
 
 @_compile
-def _plane(b, x, y, z, n1, n2, hx, hy, circle, code, fresnel, kept):
-    """Shift, advance, open and refract at a plane: its normal is Z, one root does."""
-    mu = n1 / n2
-    for i in range(BLOCK):
-        dx, dy, dz = b[DX + i], b[DY + i], b[DZ + i]
-        hit = dz > TINY
-        cos1 = dz if hit else 1.0
-        t = -(b[Z + i] + z) / cos1
-        px = b[X + i] + x + t * dx
-        py = b[Y + i] + y + t * dy
-        square = 1.0 - mu * mu * (1.0 - cos1 * cos1)
-        refracts = square > 0.0
-        cos2 = np.sqrt(square if refracts else 1.0)
-        inside = (
-            (px * px + py * py <= hx * hx) if circle != 0.0 else (abs(px) <= hx) & (abs(py) <= hy)
-        )
-        b[X + i], b[Y + i], b[Z + i] = px, py, 0.0
-        b[DX + i], b[DY + i], b[DZ + i] = mu * dx, mu * dy, cos2
-        now = 0.0 if refracts else code + REFLECTED
-        now = now if inside else code + BLOCKED
-        now = now if hit else code + MISSED
-        old = b[LOST + i]
-        now = old if old != 0.0 else now
-        b[LOST + i] = now
-        if fresnel:
-            reflected, transmitted = _fresnel(n1, n2, cos1, cos2)
-            weight = b[W + i]
-            kept[i] = weight * reflected if now == 0.0 else 0.0
-            b[W + i] = weight * transmitted if now == 0.0 else weight
-
-
-@_compile
-def _curved(b, x, y, z, c, ax, ay, n1, n2, hx, hy, circle, code, fresnel, kept):
-    """Shift, intersect, open and refract at a cylinder or sphere.
-
-    With F = c/2 (aₓ x² + a_y y² + z²) − z = 0 the gradient has length 1 on the surface, and its
-    product with the direction where light meets it is minus the root of the discriminant: the
-    cosine of incidence costs nothing. Where the centre lies before the surface (a < 0) light meets
-    it on its way out of the cylinder or sphere, from wherever it came; where it lies behind, on its
-    way in, which must be ahead.
-    """
-    mu = n1 / n2
-    sx = ax * c
-    sy = ay * c
-    for i in range(BLOCK):
-        px, py, pz = b[X + i] + x, b[Y + i] + y, b[Z + i] + z
-        dx, dy, dz = b[DX + i], b[DY + i], b[DZ + i]
-        a = sx * dx * dx + sy * dy * dy + c * dz * dz
-        half_b = sx * px * dx + sy * py * dy + (c * pz - 1.0) * dz
-        f = sx * px * px + sy * py * py + (c * pz - 2.0) * pz
-        square = half_b * half_b - a * f
-        inward = half_b < 0.0
-        hit = (square > 0.0) & (inward | (a < 0.0))
-        cos1 = np.sqrt(square if hit else 1.0)
-        # the same root twice, each without cancellation
-        t = (f if inward else -half_b - cos1) / (cos1 - half_b if inward else (a if hit else 1.0))
-        px += t * dx
-        py += t * dy
-        pz += t * dz
-        # the half of the cylinder or sphere that holds the vertex
-        hit &= c * pz < 1.0
-        square = 1.0 - mu * mu * (1.0 - cos1 * cos1)
-        refracts = square > 0.0
-        cos2 = np.sqrt(square if refracts else 1.0)
-        inside = (
-            (px * px + py * py <= hx * hx) if circle != 0.0 else (abs(px) <= hx) & (abs(py) <= hy)
-        )
-        g = mu * cos1 - cos2
-        b[X + i], b[Y + i], b[Z + i] = px, py, pz
-        b[DX + i] = mu * dx + g * sx * px
-        b[DY + i] = mu * dy + g * sy * py
-        b[DZ + i] = mu * dz + g * (c * pz - 1.0)
-        now = 0.0 if refracts else code + REFLECTED
-        now = now if inside else code + BLOCKED
-        now = now if hit else code + MISSED
-        old = b[LOST + i]
-        now = old if old != 0.0 else now
-        b[LOST + i] = now
-        if fresnel:
-            reflected, transmitted = _fresnel(n1, n2, cos1, cos2)
-            weight = b[W + i]
-            kept[i] = weight * reflected if now == 0.0 else 0.0
-            b[W + i] = weight * transmitted if now == 0.0 else weight
-
-
-@njit(inline="always")
-def _fresnel(n1, n2, cos1, cos2):
-    """Reflectance and transmittance of unpolarised light, each by its own formula."""
-    s1, s2 = n1 * cos1, n2 * cos2
-    p1, p2 = n1 * cos2, n2 * cos1
+def _split(b, i, lost, n1, n2, cos1, cos2):
+    """Split a ray's weight by Fresnel's equations, unpolarised: reflectance and transmittance."""
+    s1, s2, p1, p2 = n1 * cos1, n2 * cos2, n1 * cos2, n2 * cos1
     s, p = s1 + s2, p1 + p2
     scale = 1.0 / (s * p)
     s_part = (s1 - s2) * p * scale
     p_part = (p1 - p2) * s * scale
-    both = 2.0 * n1 * n2 * cos1 * cos2 * scale * scale
-    return 0.5 * (s_part * s_part + p_part * p_part), both * (s * s + p * p)
+    weight = b[W + i]
+    reflected = 0.5 * (s_part * s_part + p_part * p_part) * weight
+    transmitted = 2.0 * s1 * s2 * scale * scale * (s * s + p * p) * weight
+    b[KEPT + i] = reflected if lost == 0.0 else 0.0
+    b[W + i] = transmitted if lost == 0.0 else weight
+
+
+def _refraction(fresnel, circle):
+    """Loops over a block for a plane and for a curved surface; with or without Fresnel's losses.
+
+    With them, what the surface reflects of each ray's weight is put into KEPT.
+    """
+
+    @_compile
+    def plane(b, x, y, z, n1, n2, hx, hy, code):
+        """Shift, advance, open and refract: the normal is Z, one root does."""
+        mu = n1 / n2
+        for i in range(BLOCK):
+            dx, dy, dz = b[DX + i], b[DY + i], b[DZ + i]
+            hit = dz > TINY
+            cos1 = dz if hit else 1.0
+            t = -(b[Z + i] + z) / cos1
+            px = b[X + i] + x + t * dx
+            py = b[Y + i] + y + t * dy
+            square = 1.0 - mu * mu * (1.0 - cos1 * cos1)
+            refracts = square > 0.0
+            cos2 = np.sqrt(square if refracts else 1.0)
+            inside = px * px + py * py <= hx * hx if circle else (abs(px) <= hx) & (abs(py) <= hy)
+            b[X + i], b[Y + i], b[Z + i] = px, py, 0.0
+            b[DX + i], b[DY + i], b[DZ + i] = mu * dx, mu * dy, cos2
+            now = 0.0 if refracts else code + REFLECTED
+            now = now if inside else code + BLOCKED
+            now = now if hit else code + MISSED
+            old = b[LOST + i]
+            now = old if old != 0.0 else now
+            b[LOST + i] = now
+            if fresnel:
+                _split(b, i, now, n1, n2, cos1, cos2)
+
+    @_compile
+    def curved(b, x, y, z, c, ax, ay, n1, n2, hx, hy, code):
+        """Shift, intersect, open and refract.
+
+        With F = c/2 (aₓ x² + a_y y² + z²) − z = 0 the gradient has length 1 on the surface, and its
+        product with the direction where light meets it is minus the root of the discriminant: the
+        cosine of incidence costs nothing. Where the centre lies before the surface (a < 0) light
+        meets it on its way out of the cylinder or sphere, from wherever it came; where it lies
+        behind, on its way in, which must be ahead.
+        """
+        mu = n1 / n2
+        sx = ax * c
+        sy = ay * c
+        for i in range(BLOCK):
+            px, py, pz = b[X + i] + x, b[Y + i] + y, b[Z + i] + z
+            dx, dy, dz = b[DX + i], b[DY + i], b[DZ + i]
+            a = sx * dx * dx + sy * dy * dy + c * dz * dz
+            half_b = sx * px * dx + sy * py * dy + (c * pz - 1.0) * dz
+            f = sx * px * px + sy * py * py + (c * pz - 2.0) * pz
+            square = half_b * half_b - a * f
+            inward = half_b < 0.0
+            hit = (square > 0.0) & (inward | (a < 0.0))
+            cos1 = np.sqrt(square if hit else 1.0)
+            # the same root twice, each without cancellation
+            over_in, under_in = f, cos1 - half_b
+            over_out, under_out = -half_b - cos1, a if hit else 1.0
+            t = (over_in if inward else over_out) / (under_in if inward else under_out)
+            px += t * dx
+            py += t * dy
+            pz += t * dz
+            # the half of the cylinder or sphere that holds the vertex
+            hit &= c * pz < 1.0
+            square = 1.0 - mu * mu * (1.0 - cos1 * cos1)
+            refracts = square > 0.0
+            cos2 = np.sqrt(square if refracts else 1.0)
+            inside = px * px + py * py <= hx * hx if circle else (abs(px) <= hx) & (abs(py) <= hy)
+            g = mu * cos1 - cos2
+            b[X + i], b[Y + i], b[Z + i] = px, py, pz
+            b[DX + i] = mu * dx + g * sx * px
+            b[DY + i] = mu * dy + g * sy * py
+            b[DZ + i] = mu * dz + g * (c * pz - 1.0)
+            now = 0.0 if refracts else code + REFLECTED
+            now = now if inside else code + BLOCKED
+            now = now if hit else code + MISSED
+            old = b[LOST + i]
+            now = old if old != 0.0 else now
+            b[LOST + i] = now
+            if fresnel:
+                _split(b, i, now, n1, n2, cos1, cos2)
+
+    return plane, curved
+
+
+_plane, _curved = _refraction(fresnel=False, circle=False)
+_plane_round, _curved_round = _refraction(fresnel=False, circle=True)
+_plane_fresnel, _curved_fresnel = _refraction(fresnel=True, circle=False)
+_plane_fresnel_round, _curved_fresnel_round = _refraction(fresnel=True, circle=True)
 
 
 @njit(cache=True, fastmath={"contract", "reassoc"}, nogil=True)
@@ -170,7 +178,7 @@ def _sum(values, count):
 
 
 @_compile
-def through(b, steps, turned, shapes, indices, edges, fresnel, kept, reflected):
+def through(b, steps, turned, shapes, indices, edges, fresnel, reflected):
     """Trace one block from the system's frame to the sensor's plane.
 
     With `fresnel`, W is multiplied by each transmittance, and what every surface reflects is added
@@ -194,52 +202,107 @@ def through(b, steps, turned, shapes, indices, edges, fresnel, kept, reflected):
             _to_plane(b, x, y, z, code)
             _open(b, hx, hy, circle, code)
             continue
-        if c == 0.0:
-            _plane(b, x, y, z, n1, n2, hx, hy, circle, code, fresnel, kept)
-        else:
+        if c != 0.0:
             if k == 0:  # from far away, what matters near the vertex would drown in the distance
                 _to_plane(b, x, y, z, -MISSED)  # loses none: it may be met from aside
                 x = y = z = 0.0
-            _curved(b, x, y, z, c, ax, ay, n1, n2, hx, hy, circle, code, fresnel, kept)
+            if circle == 0.0:
+                if fresnel:
+                    _curved_fresnel(b, x, y, z, c, ax, ay, n1, n2, hx, hy, code)
+                else:
+                    _curved(b, x, y, z, c, ax, ay, n1, n2, hx, hy, code)
+            elif fresnel:
+                _curved_fresnel_round(b, x, y, z, c, ax, ay, n1, n2, hx, hx, code)
+            else:
+                _curved_round(b, x, y, z, c, ax, ay, n1, n2, hx, hx, code)
+        elif circle == 0.0:
+            if fresnel:
+                _plane_fresnel(b, x, y, z, n1, n2, hx, hy, code)
+            else:
+                _plane(b, x, y, z, n1, n2, hx, hy, code)
+        elif fresnel:
+            _plane_fresnel_round(b, x, y, z, n1, n2, hx, hx, code)
+        else:
+            _plane_round(b, x, y, z, n1, n2, hx, hx, code)
         if fresnel:
-            reflected[k] += _sum(kept, BLOCK)
+            reflected[k] += _sum(b[KEPT:], BLOCK)
+
+
+@_compile
+def _load(row, values, rest):
+    """Fill a row of a block, and what is left of it with `rest`."""
+    for i in range(len(values)):
+        row[i] = values[i]
+    for i in range(len(values), BLOCK):
+        row[i] = rest
+
+
+@_compile
+def _save(values, row, lost):
+    """Take a row out of a block: 0 for lost rays, whose numbers have no meaning."""
+    for i in range(len(values)):
+        value = row[i]
+        values[i] = value if lost[i] == 0.0 else 0.0
+
+
+@_compile
+def _save_losses(status, surface, lost):
+    for i in range(len(status)):
+        code = np.int32(lost[i])
+        status[i] = code & 3
+        surface[i] = (code >> 2) if code != 0 else -1
+
+
+@_compile
+def _normalise(b, doubtful, front):
+    """Make directions unit vectors; mark rays that a closer look might refuse."""
+    for i in range(BLOCK):
+        x, y, z = b[X + i], b[Y + i], b[Z + i]
+        dx, dy, dz = b[DX + i], b[DY + i], b[DZ + i]
+        square = dx * dx + dy * dy + dz * dz
+        usual = (square > 1e-100) & (square < 1e100) & (dz > TINY) & (z < front)
+        usual &= 0.0 * (x + y + z) == 0.0  # false for what is not finite
+        scale = 1.0 / np.sqrt(square if usual else 1.0)
+        b[DX + i] = dx * scale
+        b[DY + i] = dy * scale
+        b[DZ + i] = dz * scale
+        b[W + i] = 1.0
+        b[LOST + i] = 0.0
+        doubtful[i] = 0.0 if usual else 1.0
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"}, nogil=True, parallel=True)
-def trace(position, direction, rays, steps, turned, shapes, indices, edges, fresnel, out, lost):
-    """Trace rays (3, N) to the sensor: x, y, direction and transmission into out (6, N)."""
+def trace(
+    position, direction, front, steps, turned, shapes, indices, edges, fresnel, out, status, surface
+):
+    """Trace rays (3, N) to the sensor: x, y, direction and transmission into out (6, N).
+
+    Returns how many rays are doubtful: they do not start before z = `front`, do not go forward, or
+    are not finite.
+    """
+    rays = position.shape[1]
     blocks = (rays + BLOCK - 1) // BLOCK
+    doubts = np.zeros(blocks)
     for j in prange(blocks):
         b = np.empty(SIZE)
-        kept = np.empty(BLOCK)
         reflected = np.zeros(len(shapes))
         start = j * BLOCK
-        size = min(BLOCK, rays - start)
+        end = min(start + BLOCK, rays)
         for row in range(3):
-            for i in range(size):
-                b[row * BLOCK + i] = position[row, start + i]
-                b[(3 + row) * BLOCK + i] = direction[row, start + i]
-            for i in range(size, BLOCK):
-                b[row * BLOCK + i] = 0.0
-                b[(3 + row) * BLOCK + i] = 1.0
-        for i in range(BLOCK):
-            dx, dy, dz = b[DX + i], b[DY + i], b[DZ + i]
-            scale = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
-            b[DX + i] = dx * scale
-            b[DY + i] = dy * scale
-            b[DZ + i] = dz * scale
-            b[W + i] = 1.0
-            b[LOST + i] = 0.0
-        through(b, steps, turned, shapes, indices, edges, fresnel, kept, reflected)
-        for i in range(size):  # the lost ones hold numbers without meaning
-            alive = b[LOST + i] == 0.0
-            out[0, start + i] = b[X + i] if alive else 0.0
-            out[1, start + i] = b[Y + i] if alive else 0.0
-            out[2, start + i] = b[DX + i] if alive else 0.0
-            out[3, start + i] = b[DY + i] if alive else 0.0
-            out[4, start + i] = b[DZ + i] if alive else 0.0
-            out[5, start + i] = b[W + i] if alive else 0.0
-            lost[start + i] = np.int16(b[LOST + i])
+            _load(b[row * BLOCK :], position[row, start:end], front - 1.0)
+            _load(b[(3 + row) * BLOCK :], direction[row, start:end], 1.0)
+        _normalise(b, b[KEPT:], front)
+        doubts[j] = _sum(b[KEPT:], BLOCK)
+        through(b, steps, turned, shapes, indices, edges, fresnel, reflected)
+        lost = b[LOST:]
+        _save(out[0, start:end], b[X:], lost)
+        _save(out[1, start:end], b[Y:], lost)
+        _save(out[2, start:end], b[DX:], lost)
+        _save(out[3, start:end], b[DY:], lost)
+        _save(out[4, start:end], b[DZ:], lost)
+        _save(out[5, start:end], b[W:], lost)
+        _save_losses(status[start:end], surface[start:end], lost)
+    return doubts.sum()
 
 
 @_compile
@@ -250,11 +313,18 @@ def _emit(b, first, count, ny, source, grid, lobe, facing):
     the intensity is 1, or by the cosine to `facing` from a table over 0 to 1. Rays beyond `count`
     carry nothing.
     """
+    column = first // ny
+    row = first - column * ny
     for i in range(BLOCK):
-        ray = min(first + i, first + count - 1)
-        column = ray // ny
-        u = grid[0] + (column + 0.5) * grid[1]
-        v = grid[2] + (ray - column * ny + 0.5) * grid[3]
+        b[X + i] = column
+        b[Y + i] = row
+        row += i < count - 1  # the rest repeats the last one
+        if row == ny:
+            row = 0
+            column += 1
+    for i in range(BLOCK):
+        u = grid[0] + (b[X + i] + 0.5) * grid[1]
+        v = grid[2] + (b[Y + i] + 0.5) * grid[3]
         dx = u - source[0]
         dy = v - source[1]
         dz = source[2]
@@ -266,7 +336,7 @@ def _emit(b, first, count, ny, source, grid, lobe, facing):
         b[DX + i] = dx * scale
         b[DY + i] = dy * scale
         b[DZ + i] = dz * scale
-        b[W + i] = grid[1] * grid[3] * dz * scale / square
+        b[W + i] = grid[1] * grid[3] * dz * scale * scale * scale
         b[LOST + i] = 0.0
     last = len(lobe) - 1
     if last > 0:
@@ -280,12 +350,11 @@ def _emit(b, first, count, ny, source, grid, lobe, facing):
 
 
 @_compile
-def _columns(first, columns, ny, source, grid, lobe, facing, parts, fresnel, work, rays, reflected):
+def _columns(first, columns, ny, source, grid, lobe, facing, parts, fresnel, b, rays, reflected):
     """Trace whole columns of the pupil into rays (4, …): x, y, weight and LOST at the sensor.
 
     Returns the emitted power.
     """
-    b, kept = work
     steps, turned, shapes, indices, edges = parts
     emitted = 0.0
     count = columns * ny
@@ -293,12 +362,10 @@ def _columns(first, columns, ny, source, grid, lobe, facing, parts, fresnel, wor
         size = min(BLOCK, count - start)
         _emit(b, first * ny + start, size, ny, source, grid, lobe, facing)
         emitted += _sum(b[W:], size)
-        through(b, steps, turned, shapes, indices, edges, fresnel, kept, reflected)
+        through(b, steps, turned, shapes, indices, edges, fresnel, reflected)
         for i in range(size):
-            rays[0, start + i] = b[X + i]
-            rays[1, start + i] = b[Y + i]
-            rays[2, start + i] = b[W + i]
-            rays[3, start + i] = b[LOST + i]
+            rays[0, start + i], rays[1, start + i] = b[X + i], b[Y + i]
+            rays[2, start + i], rays[3, start + i] = b[W + i], b[LOST + i]
     return emitted
 
 
@@ -400,7 +467,7 @@ def illuminate(
     each_pixels = np.zeros((strips, len(pixels)))
     each_account = np.zeros((strips, surfaces + 1, 4))
     for strip in prange(strips):
-        work = (np.empty(SIZE), np.empty(BLOCK))
+        b = np.empty(SIZE)
         mine = each_account[strip]
         reflected = np.zeros(surfaces)
         ignored = np.zeros(surfaces)
@@ -411,16 +478,16 @@ def illuminate(
         rays[3] = 1.0
         own = rays[:, ny : (columns + 1) * ny]
         mine[surfaces, 0] = _columns(
-            first, columns, ny, source, grid, lobe, facing, parts, fresnel, work, own, reflected
+            first, columns, ny, source, grid, lobe, facing, parts, fresnel, b, own, reflected
         )
         if first > 0:
             _columns(
-                first - 1, 1, ny, source, grid, lobe, facing, parts, fresnel, work,
+                first - 1, 1, ny, source, grid, lobe, facing, parts, fresnel, b,
                 rays[:, :ny], ignored,
             )  # fmt: skip
         if first + columns < nx:
             _columns(
-                first + columns, 1, ny, source, grid, lobe, facing, parts, fresnel, work,
+                first + columns, 1, ny, source, grid, lobe, facing, parts, fresnel, b,
                 rays[:, (columns + 1) * ny :], ignored,
             )  # fmt: skip
         for column in range(1, columns + 1):
@@ -454,12 +521,10 @@ def columns_of(nx, ny, source, grid, steps, turned, shapes, indices, edges, half
     that put any light there.
     """
     parts = (steps, turned, shapes, indices, edges)
-    work = (np.empty(SIZE), np.empty(BLOCK))
+    b = np.empty(SIZE)
     rays = np.empty((4, nx * ny))
     no_lobe, ahead = np.empty(0), np.zeros(3)
-    _columns(
-        0, nx, ny, source, grid, no_lobe, ahead, parts, True, work, rays, np.zeros(len(shapes))
-    )
+    _columns(0, nx, ny, source, grid, no_lobe, ahead, parts, True, b, rays, np.zeros(len(shapes)))
     first, last = ny, -1
     for column in range(nx):
         total = 0.0

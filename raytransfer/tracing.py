@@ -65,6 +65,16 @@ class Trace:
     status: NDArray[np.uint8]
     surface: NDArray[np.int16]
 
+    def _numbers(self, count: int) -> NDArray[np.float64]:
+        """Return the array (6, count) that its parts are rows of, to be written over."""
+        base = self.x.base
+        if base is None or base.shape != (6, count):
+            raise ValueError(
+                f"out: a Trace of {len(self.x)} rays cannot take {count}; give one that trace "
+                "returned for as many"
+            )
+        return base
+
     @classmethod
     def of(cls, out: NDArray[np.float64], lost: NDArray[np.int16]) -> Trace:
         """Name the parts of what a tracer wrote: out (6, N) and lost (N,)."""
@@ -85,6 +95,7 @@ def trace(
     wavelength: float = D_LINE,
     fresnel: bool = True,
     threads: int | None = None,
+    out: Trace | None = None,
 ) -> Trace:
     """Trace rays to the sensor, or to the plane of the last vertex if there is none.
 
@@ -102,6 +113,8 @@ def trace(
         Whether to compute the transmission.
     threads : int, optional
         How many to use; all when left out. The result is the same bit for bit.
+    out : Trace, optional
+        What an earlier call returned for as many rays: written over, which spares fresh memory.
 
     Raises
     ------
@@ -109,26 +122,27 @@ def trace(
         If a number is not finite, a ray starts in or behind the glass, or it does not go forward.
     """
     kernels = load_kernels()
-    start, toward = checked_rays(system, position, direction)
+    start, toward = _rays(position, direction)
     count = start.shape[1]
-    out, lost = np.empty((6, count)), np.empty(count, np.int16)
+    traced = np.empty((6, count)) if out is None else out._numbers(count)
+    status = np.empty(count, np.uint8) if out is None else out.status
+    surface = np.empty(count, np.int16) if out is None else out.surface
     parts = prescription(system, wavelength)
     with using(threads):
-        kernels.trace(start, toward, count, *parts, fresnel, out, lost)
-    return Trace.of(out, lost)
+        arguments = (_foremost(system), *parts, fresnel, traced, status, surface)
+        if kernels.trace(start, toward, *arguments):
+            start, toward = checked_rays(system, position, direction)
+            kernels.trace(start, toward, *arguments)
+    return Trace(traced[0], traced[1], traced[2:5], traced[5], status, surface)
 
 
 def checked_rays(
     system: OpticalSystem, position: ArrayLike, direction: ArrayLike
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return rays as arrays (3, N), or refuse them as `trace` does."""
-    start = np.ascontiguousarray(check.array("position", position, "mm"))
-    toward = np.ascontiguousarray(check.array("direction", direction))
-    if start.ndim != 2 or len(start) != 3 or start.shape != toward.shape:
-        raise ValueError(
-            f"position {start.shape} and direction {toward.shape}: both are (3, N): x, y and z "
-            "of N rays"
-        )
+    start, toward = _rays(position, direction)
+    check.array("position", start, "mm")
+    check.array("direction", toward)
     if not start.size:
         return start, toward
     if toward[2].min() <= 0:
@@ -142,9 +156,8 @@ def checked_rays(
     first = system.elements[0]
     size = (first.size("x") / 2, first.size("y") / 2)
     foremost = min(front.depth(size), 0.0)
-    tilt = np.abs(rotation[2, :2]) @ np.where(np.isfinite(size), size, 0.0)
-    if start[2].max() < origin[2] + foremost - tilt:
-        return start, toward  # all of them before everything: the usual case
+    if start[2].max() < _foremost(system):
+        return start, toward
     x, y, z = rotation.T @ (start - origin[:, None])
     beside = (np.abs(x) > size[0]) | (np.abs(y) > size[1])
     if front.round:
@@ -158,6 +171,31 @@ def checked_rays(
             f"{first.part}, whose vertex is at z = {origin[2]:g}; sources have negative z"
         )
     return start, toward
+
+
+def _rays(
+    position: ArrayLike, direction: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return rays as contiguous arrays (3, N), or refuse their shapes."""
+    start, toward = (
+        np.ascontiguousarray(check.numbers(name, values))
+        for name, values in (("position", position), ("direction", direction))
+    )
+    if start.ndim != 2 or len(start) != 3 or start.shape != toward.shape:
+        raise ValueError(
+            f"position {start.shape} and direction {toward.shape}: both are (3, N): x, y and z "
+            "of N rays"
+        )
+    return start, toward
+
+
+def _foremost(system: OpticalSystem) -> float:
+    """Return a z before all of the first element, mm."""
+    front, rotation, origin = surface_frames(system)[0]
+    first = system.elements[0]
+    size = (first.size("x") / 2, first.size("y") / 2)
+    tilt = np.abs(rotation[2, :2]) @ np.where(np.isfinite(size), size, 0.0)
+    return float(origin[2] + min(front.depth(size), 0.0) - tilt)
 
 
 class Bundle(NamedTuple):

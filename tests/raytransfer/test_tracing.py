@@ -1159,3 +1159,17 @@ def test_bundles_of_no_number_of_rays_are_refused(bad: Any) -> None:
         bundle(HEAD, (0.0, 0.0, 100.0), bad, 4)
     with pytest.raises(ValueError, match=f"^ny = {bad}"):
         bundle(HEAD, (0.0, 0.0, 100.0), 4, bad)
+
+
+def test_a_trace_can_be_written_over() -> None:
+    """The same numbers in the same memory; of another size it is refused, and left alone."""
+    head = prototype_head()
+    first, second = (bundle(head, (x, 0.0, 1300.0), 40, 30) for x in (0.0, 300.0))
+    place = trace(head, first.position, first.direction)
+    fresh = trace(head, second.position, second.direction)
+    again = trace(head, second.position, second.direction, out=place)
+    assert np.shares_memory(again.x, place.x)
+    for name in ("x", "y", "direction", "transmission", "status", "surface"):
+        assert np.array_equal(getattr(again, name), getattr(fresh, name))
+    with pytest.raises(ValueError, match="of 1200 rays cannot take 10"):
+        trace(head, first.position[:, :10], first.direction[:, :10], out=place)
