@@ -3,7 +3,8 @@
     from raytransfer.explorer import Explorer
     Explorer()
 
-as the last line of a notebook cell. What is shown is paraxial.
+as the last line of a notebook cell. What is shown is paraxial; a switch adds exact rays and what
+they say of the light.
 """
 
 from __future__ import annotations
@@ -11,9 +12,11 @@ from __future__ import annotations
 import html
 import math
 import struct
+import sys
 import traceback
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import ipywidgets as widgets
@@ -24,8 +27,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
 from raytransfer import plots
+from raytransfer.analysis import Spot, fan
 from raytransfer.casting import cast_rays
 from raytransfer.lenses import CATALOGUE, THESIS_LENSES, Lens
+from raytransfer.reference import path
 from raytransfer.sensors import TCD1304, LineSensor
 from raytransfer.studies import (
     FAR,
@@ -37,6 +42,7 @@ from raytransfer.studies import (
     tracking_start,
 )
 from raytransfer.systems import OpticalSystem, telecentric_pair
+from raytransfer.tracing import front_opening, load_kernels, using
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -46,6 +52,17 @@ if TYPE_CHECKING:
 _ROOM_WIDTH = 3000.0
 _ROOM_DEPTH = 6000.0
 _LEAD = 30.0  # mm of incoming rays drawn in front of the lenses
+_FAN = 4001  # rays that are measured: medians to about 0.1 px, widths to a pixel
+_DRAWN = 12  # thin rays in the picture
+_INNER = 0.95  # of the height: light that enters further out leaves through the first lens's rim
+
+_TITLES = {
+    False: ("rays along the pixel line (paraxial)", "room from above; shaded: two LEDs seen"),
+    True: (
+        "rays along the pixel line: exact; dashed: paraxial",
+        "room, paraxial; shaded: two LEDs seen",
+    ),
+}
 
 
 @dataclass(frozen=True)
@@ -60,6 +77,7 @@ class View:
     source_dist: float
     axis_off: float
     led_spacing: float
+    exact: bool = False
 
     @property
     def half_length(self) -> float:
@@ -97,9 +115,6 @@ class View:
         position = image_position(*setting, self.axis_off, self.sensor_dist)
         width = beam_width(self.aperture, *setting, self.sensor_dist)
         pixel = lateral_resolution(*setting, self.sensor.pitch, self.sensor_dist)
-        where = f"pixel {float(self.sensor.pixel(position)):.1f}"
-        if abs(position) > self.half_length:
-            where = "off the sensor"
         return {
             "focus of this source": (
                 f"{focus:.3f} mm behind the lenses"
@@ -107,13 +122,88 @@ class View:
                 else f"virtual, {-focus:.3f} mm before the last surface"
             ),
             "sensor": f"{self.sensor_dist:.3f} mm behind the lenses",
-            "image": f"{position:.3f} mm, {where}",
+            "image": self._place(position),
             "beam width": f"{width:.3f} mm, {width / self.sensor.pitch:.0f} px",
             "field edge here": f"{self.field_edge:.0f} mm",
             "one pixel here": f"{pixel:.3f} mm",
             "tracking starts at": f"{self.tracking_start:.0f} mm",
             "LEDs seen": f"{self.seen.sum()}",
         }
+
+    @cached_property
+    def _exact_system(self) -> OpticalSystem:
+        return replace(self.system, sensor_distance=self.sensor_dist)
+
+    @cached_property
+    def light(self) -> Spot:
+        """Exact light of the source in the plane of the pixel line, at the d line of the matrices.
+
+        Raises
+        ------
+        ModuleNotFoundError
+            Without numba.
+        """
+        load_kernels()
+        with using(1):  # so short a task would wait longer for a second thread than it takes
+            return fan(self._exact_system, "x", self.source_dist, self.axis_off, rays=_FAN)
+
+    def exact_results(self) -> dict[str, str]:
+        """What exact light adds to `results`, as text; see `light`."""
+        light = self.light
+        found = light.profile("x", self.sensor.pitch)
+        paraxial = image_position(self.matrix, self.source_dist, self.axis_off, self.sensor_dist)
+
+        def pixels(length: float, form: str) -> str:
+            return f"{length / self.sensor.pitch:{form}} px" if light.x.size else "–"
+
+        on_sensor = light.on(self.sensor)
+        faded = light.faded / light.entered if light.entered else 0.0
+        return {
+            "image, median": self._place(found.median),
+            "image, peak": self._place(found.peak),
+            "median − paraxial": pixels(found.median - paraxial, "+z.1f"),
+            "peak − paraxial": pixels(found.peak - paraxial, "+z.1f"),
+            "50 % of the light in": pixels(found.w50, ".0f"),
+            "80 % of the light in": pixels(found.w80, ".0f"),
+            "light lost": (
+                f"{100 * light.lost_share():.1f} % on the way, {100 * faded:.1f} % reflected"
+            ),
+            "light on the sensor": (
+                f"{100 * light.arrived * on_sensor:.1f} % of all, "
+                f"{100 * on_sensor:.1f} % of what arrives"
+            ),
+        }
+
+    def exact_rays(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+        """Exact rays to draw: through the upper edge, nearly, the middle and the lower edge; others.
+
+        Returns
+        -------
+        z, height : ndarray, shape (P, 3 + K)
+            From the source through the surfaces to a little behind the sensor, mm. A ray that is
+            lost ends there.
+        lost : ndarray of bool, shape (3 + K,)
+        """
+        system = self._exact_system
+        low, high, _, _ = front_opening(system, (self.axis_off, 0.0, self.source_dist))
+        between = low + (np.arange(_DRAWN) + 0.5) * (high - low) / _DRAWN
+        edges = _INNER * self.aperture / 2 * np.array([1.0, 0.0, -1.0])
+        aim = np.zeros((3, 3 + _DRAWN))
+        aim[0] = np.concatenate([edges, between])
+        start = np.zeros_like(aim)
+        start[0], start[2] = self.axis_off, -self.source_dist
+        points = path(system, start, aim - start)
+        lost = (points[-1] == points[-2]).all(axis=0)
+        points[-1] += 0.25 * (points[-1] - points[-2])
+        return points[:, 2], points[:, 0], lost
+
+    def _place(self, position: float) -> str:
+        """Describe a place on the sensor's plane."""
+        if math.isnan(position):
+            return "no light arrives"
+        if abs(position) > self.half_length:
+            return f"{position:z.3f} mm, off the sensor"
+        return f"{position:z.3f} mm, pixel {float(self.sensor.pixel(position)):.1f}"
 
 
 class Explorer(widgets.VBox):  # type: ignore[misc]
@@ -135,6 +225,9 @@ class Explorer(widgets.VBox):  # type: ignore[misc]
     led_spacing : float
         mm.
     sensor : LineSensor
+    exact : bool
+        Whether exact rays are shown, too. They need numba, which is loaded when they are first
+        wanted, and which then compiles for some seconds.
     """
 
     def __init__(
@@ -148,6 +241,7 @@ class Explorer(widgets.VBox):  # type: ignore[misc]
         axis_off: float = 300.0,
         led_spacing: float = 500.0,
         sensor: LineSensor = TCD1304,
+        exact: bool = False,
     ) -> None:
         self._sensor = sensor
         names = [
@@ -172,6 +266,7 @@ class Explorer(widgets.VBox):  # type: ignore[misc]
         self.source_dist = _slider("source", "mm", source_dist, 200, _ROOM_DEPTH, 10)
         self.axis_off = _slider("offset", "mm", axis_off, -_ROOM_WIDTH, _ROOM_WIDTH, 10)
         self.led_spacing = _slider("LED spacing", "mm", led_spacing, 100, 2000, 10)
+        self.exact = widgets.Checkbox(value=exact, description="exact rays", indent=False)
         self.picture = widgets.Image(format="png")
         self.readout = widgets.HTML()
         self.error = widgets.HTML()
@@ -184,6 +279,7 @@ class Explorer(widgets.VBox):  # type: ignore[misc]
             self.source_dist,
             self.axis_off,
             self.led_spacing,
+            self.exact,
         )
         self._drawing = Drawing(sensor)
         self._redraw()
@@ -193,7 +289,7 @@ class Explorer(widgets.VBox):  # type: ignore[misc]
             [
                 widgets.HBox(
                     [
-                        widgets.VBox([self.front, self.back, self.gap, self.focus]),
+                        widgets.VBox([self.front, self.back, self.gap, self.focus, self.exact]),
                         widgets.VBox(
                             [self.source_dist, self.axis_off, self.led_spacing, self.sensor_dist]
                         ),
@@ -222,13 +318,20 @@ class Explorer(widgets.VBox):  # type: ignore[misc]
             self.source_dist.value,
             self.axis_off.value,
             self.led_spacing.value,
+            self.exact.value,
         )
 
     def _changed(self, change: dict[str, Any]) -> None:
         if change["owner"] is self.sensor_dist and self.focus.value:
             return  # moved by _redraw itself
+        if self.exact.value and "raytransfer._kernels" not in sys.modules:
+            self.error.value = "compiling what traces exact rays: some seconds, once …"
         try:
             self._redraw()
+        except ModuleNotFoundError as error:
+            self.exact.value = False  # which draws what can be drawn
+            self.error.value = f'<pre style="color:#b00020">{html.escape(str(error))}</pre>'
+            raise
         except Exception:
             self.error.value = (
                 f'<pre style="color:#b00020;line-height:1.2">{html.escape(traceback.format_exc())}'
@@ -239,10 +342,13 @@ class Explorer(widgets.VBox):  # type: ignore[misc]
 
     def _redraw(self) -> None:
         view = self.view()
+        tables = {"paraxial": view.results()}
+        if view.exact:
+            tables["exact, of the light in the plane of the pixel line"] = view.exact_results()
         self.sensor_dist.disabled = self.focus.value
         self.sensor_dist.value = view.sensor_dist
         self.picture.value = self._drawing.png(view)
-        self.readout.value = _table(view.results())
+        self.readout.value = _table(tables)
 
 
 def _slider(label: str, unit: str, value: float, low: float, high: float, step: float) -> Any:
@@ -260,16 +366,23 @@ def _slider(label: str, unit: str, value: float, low: float, high: float, step: 
     )
 
 
-def _table(results: dict[str, str]) -> str:
+def _table(tables: dict[str, dict[str, str]]) -> str:
+    """Quantities and values side by side, under the titles of their tables."""
     cell = '<td style="padding:0 1.5em 0 0;{}">{}</td>'
-    items = list(results.items())
-    rows = (items[row::4] for row in range(4))
-    body = "".join(
-        "<tr>"
-        + "".join(cell.format("color:#666", k) + cell.format("font-weight:600", v) for k, v in row)
-        + "</tr>"
-        for row in rows
-    )
+    body = ""
+    for title, results in tables.items():
+        if len(tables) > 1:
+            body += f'<tr><th colspan="4" style="text-align:left">{title}</th></tr>'
+        items = list(results.items())
+        rows = (items[row::4] for row in range(4))
+        body += "".join(
+            "<tr>"
+            + "".join(
+                cell.format("color:#666", k) + cell.format("font-weight:600", v) for k, v in row
+            )
+            + "</tr>"
+            for row in rows
+        )
     return f"<table>{body}</table>"
 
 
@@ -284,19 +397,21 @@ class Drawing:
             self._optics, self._room = self.figure.subplots(1, 2, width_ratios=(1.5, 1))
             optics, room = self._optics, self._room
             optics.set(
-                title="rays along the pixel line (paraxial)",
                 xlabel="along the axis from the first surface (mm)",
                 ylabel="height (mm)",
                 ylim=(-22, 22),
             )
             room.set(
-                title="room from above; shaded: two LEDs seen",
                 xlabel="x (m)",
                 ylabel="y from the LEDs (m)",
                 aspect="equal",
                 xlim=(-_ROOM_WIDTH / 1000, _ROOM_WIDTH / 1000),
                 ylim=(-0.25, _ROOM_DEPTH / 1000),
             )
+            self._titles = [
+                axes.set_title(title)
+                for axes, title in zip((optics, room), _TITLES[False], strict=True)
+            ]
             half = sensor.length / 2
             # in the order in which they are painted
             self._tracked = room.axhspan(0, 1, facecolor="#deebf7")
@@ -311,7 +426,11 @@ class Drawing:
                 optics.add_patch(Polygon(np.zeros((3, 2)), facecolor=plots.GLASS, edgecolor="0.35"))
                 for _ in range(2)
             ]
+            (self._between,) = optics.plot([], [], color="0.45", linewidth=0.5)
             self._rays = [optics.plot([], [], color=colour)[0] for colour in plots.RAYS]
+            self._width = self._rays[0].get_linewidth()
+            self._exact = [optics.plot([], [], color=colour)[0] for colour in plots.RAYS]
+            (self._lost,) = optics.plot([], [], "x", color="k", markersize=5)
             (self._line,) = optics.plot([], [], color=plots.SENSOR, linewidth=4)
             self._line.set_ydata([-half, half])
             self._half = half
@@ -324,7 +443,14 @@ class Drawing:
                 self._seen_leds,
                 self._tracker,
             ],
-            optics: [*self._lenses, *self._rays, self._line],
+            optics: [
+                *self._lenses,
+                self._between,
+                *self._rays,
+                *self._exact,
+                self._line,
+                self._lost,
+            ],
         }
         for artists in self.moving.values():
             for artist in artists:
@@ -332,17 +458,17 @@ class Drawing:
         # lay out once, so that the axes stay where they are whatever is shown
         self._canvas.draw()
         self.figure.set_layout_engine("none")
-        self._reach = 0.0
+        self._shown = (0.0, False)
         self._background: Any = None
 
     def place(self, view: View) -> None:
         """Put all artists where the view has them."""
         system, source_dist, axis_off = view.system, view.source_dist, view.axis_off
-        self._show_up_to(system.length + 1.3 * view.sensor_dist)
+        self._show_up_to(system.length + 1.3 * view.sensor_dist, view.exact)
         for patch, placed in zip(self._lenses, system.layout(), strict=True):
             patch.set_xy(plots.outline(placed, "x", view.half_length))
         z, heights = plots.ray_paths(
-            view.aperture,
+            view.aperture * (_INNER if view.exact else 1.0),
             system.length,
             view.matrix,
             source_dist,
@@ -352,6 +478,7 @@ class Drawing:
         for line, ray in zip(self._rays, heights.T, strict=True):
             line.set_data(z, ray)
         self._line.set_xdata([system.length + view.sensor_dist] * 2)
+        self._place_exact(view)
 
         # the part of the line of LEDs that the tracker sees
         left, right = axis_off - view.field_edge, axis_off + view.field_edge
@@ -365,6 +492,26 @@ class Drawing:
         self._seen_leds.set_data(seen / 1000, 0 * seen)
         self._tracker.set_data([axis_off / 1000], [source_dist / 1000])
 
+    def _place_exact(self, view: View) -> None:
+        for line in self._rays:
+            line.set(
+                linewidth=0.8 if view.exact else self._width,
+                linestyle=(0, (5, 3)) if view.exact else "-",
+            )
+        for artist in (self._between, *self._exact, self._lost):
+            artist.set_visible(view.exact)
+        if not view.exact:
+            return
+        z, height, lost = view.exact_rays()
+        for number, line in enumerate(self._exact):
+            line.set_data(z[:, number], height[:, number])
+        # all others as one line with gaps
+        gap = np.full((1, _DRAWN), np.nan)
+        self._between.set_data(
+            *(np.concatenate([part[:, 3:], gap]).T.ravel() for part in (z, height))
+        )
+        self._lost.set_data(z[-1, lost], height[-1, lost])
+
     def png(self, view: View) -> bytes:
         """Return the picture of a view: the background, and the artists over it."""
         self.place(view)
@@ -374,12 +521,14 @@ class Drawing:
                 axes.draw_artist(artist)
         return _png(np.asarray(self._canvas.buffer_rgba())[..., :3])
 
-    def _show_up_to(self, z: float) -> None:
-        """Draw the background anew if its axis must reach further, or much less far."""
+    def _show_up_to(self, z: float, exact: bool) -> None:
+        """Draw the background anew for other titles, or a reach that is further or much shorter."""
         reach = 10 * 1.25 ** math.ceil(math.log(z / 10, 1.25))
-        if reach != self._reach:
-            self._reach = reach
+        if (reach, exact) != self._shown:
+            self._shown = reach, exact
             self._optics.set_xlim(-_LEAD, reach)
+            for title, text in zip(self._titles, _TITLES[exact], strict=True):
+                title.set_text(text)
             self._canvas.draw()
             self._background = self._canvas.copy_from_bbox(self.figure.bbox)
 

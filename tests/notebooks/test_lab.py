@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.lab import Lab, chromium
+from benchmarks.lab import READY, Lab, chromium
 
 NOTEBOOKS = Path(__file__).parents[2] / "notebooks"
 
@@ -38,3 +38,13 @@ def test_key_press_moves_slider_and_redraws(tmp_path: Path) -> None:
         )
         assert float(handle.get_attribute("aria-valuenow") or "nan") == value + 10
         assert picture.screenshot() != before
+
+        before = picture.screenshot()
+        lab.page.get_by_label("exact rays").first.check()
+        exact = lab.page.locator(".widget-html", has_text="median − paraxial").first
+        exact.wait_for(timeout=READY)
+        assert picture.screenshot() != before
+        assert "compiling" not in lab.page.locator(".jupyter-widgets").first.inner_text()
+        lab.page.get_by_label("exact rays").first.uncheck()
+        exact.wait_for(state="detached", timeout=30_000)
+        assert picture.screenshot() == before

@@ -5,15 +5,23 @@ from __future__ import annotations
 import html
 import io
 import math
+import subprocess
+import sys
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
+import raytransfer
 from raytransfer import SENSORS, TCD1304, LineSensor, cast_rays, telecentric_pair
+from raytransfer.analysis import fan
 from raytransfer.explorer import Explorer
+from raytransfer.plots import RAYS
 from raytransfer.studies import (
     beam_width,
     field_edge,
@@ -41,8 +49,9 @@ def shared() -> Explorer:
     return Explorer()
 
 
-def put(explorer: Explorer, settings: dict[str, Any]) -> None:
+def put(explorer: Explorer, settings: dict[str, Any], *, exact: bool = False) -> None:
     """Move the controls as if the explorer had been made with these settings."""
+    explorer.exact.value = exact
     explorer.focus.value = settings["sensor_dist"] is None
     for name, value in settings.items():
         if value is not None:
@@ -249,6 +258,229 @@ def test_the_sensor_can_be_let_go() -> None:
     assert explorer.sensor_dist.disabled
     matrix = telecentric_pair("PCX_30_32_60", "LJ1567L1").matrix("x")
     assert explorer.sensor_dist.value == cast_rays(30, matrix, 5000, 0).focal_length
+
+
+# --- exact rays -----------------------------------------------------------------------------
+
+
+def test_nothing_is_compiled_before_the_switch_is_on() -> None:
+    code = """
+import sys
+from raytransfer.explorer import Explorer
+explorer = Explorer()
+explorer.source_dist.value = 1000
+print("numba" in sys.modules)
+"""
+    command = [sys.executable, "-c", code]
+    assert subprocess.run(command, capture_output=True, check=True).stdout == b"False\n"
+
+
+@pytest.mark.parametrize("sensor_dist", [None, 33.0])
+@pytest.mark.parametrize(("source_dist", "axis_off"), [(1500.0, -200.0), (2000.0, 700.0)])
+def test_exact_results_are_those_of_the_analysis(
+    shared: Explorer, sensor_dist: float | None, source_dist: float, axis_off: float
+) -> None:
+    changed = {"sensor_dist": sensor_dist, "source_dist": source_dist, "axis_off": axis_off}
+    put(shared, {**SETTINGS, **changed}, exact=True)
+    view = shared.view()
+    system = replace(
+        telecentric_pair("LJ1430L1", "LJ1567L1", 2.0), sensor_distance=view.sensor_dist
+    )
+    light = fan(system, "x", source_dist, axis_off, rays=4001)
+    found, pitch = light.profile(), 0.008
+    middle = image_position(view.matrix, source_dist, axis_off, view.sensor_dist)
+    lost = 1 - light.arrived - light.faded / light.entered
+    assert shared.view().exact_results() == {
+        "image, median": f"{found.median:.3f} mm, pixel {found.median / pitch + 1823.5:.1f}",
+        "image, peak": f"{found.peak:.3f} mm, pixel {found.peak / pitch + 1823.5:.1f}",
+        "median − paraxial": f"{(found.median - middle) / pitch:+.1f} px",
+        "peak − paraxial": f"{(found.peak - middle) / pitch:+.1f} px",
+        "50 % of the light in": f"{found.w50 / pitch:.0f} px",
+        "80 % of the light in": f"{found.w80 / pitch:.0f} px",
+        "light lost": f"{100 * lost:.1f} % on the way, "
+        f"{100 * light.faded / light.entered:.1f} % reflected",
+        "light on the sensor": f"{100 * light.arrived * light.on():.1f} % of all, "
+        f"{100 * light.on():.1f} % of what arrives",
+    }
+    # a finer fan says the same
+    finer = fan(system, "x", source_dist, axis_off, rays=40_001)
+    assert_allclose(finer.profile().median, found.median, atol=0.5 * pitch)
+    assert_allclose(finer.profile().w80, found.w80, atol=2 * pitch)
+    shown = html.unescape(shared.readout.value)
+    for quantity, value in {**view.results(), **view.exact_results()}.items():
+        assert quantity in shown
+        assert value in shown
+
+
+def test_results_stay_paraxial(shared: Explorer) -> None:
+    put(shared, SETTINGS)
+    before = shared.view().results()
+    shared.exact.value = True
+    assert shared.view().results() == before
+
+
+def test_the_switch_adds_exact_rays_and_takes_them_away(shared: Explorer) -> None:
+    put(shared, SETTINGS)
+    picture, readout = shared.picture.value, shared.readout.value
+    assert "exact" not in readout
+    shared.exact.value = True
+    assert shared.picture.value != picture
+    assert "exact" in shared.readout.value
+    other = shared.picture.value
+    shared.source_dist.value += 300
+    assert shared.picture.value != other
+    shared.source_dist.value -= 300
+    assert shared.picture.value == other
+    shared.exact.value = False
+    assert shared.picture.value == picture
+    assert shared.readout.value == readout
+    # whether it was switched on before or after the others were moved
+    new = Explorer(**SETTINGS, exact=True)
+    assert new.picture.value == other
+    new.exact.value = False
+    assert new.picture.value == picture
+
+
+def test_the_titles_say_what_is_exact(shared: Explorer) -> None:
+    drawing = shared._drawing
+    for exact, titles in (
+        (False, ("rays along the pixel line (paraxial)", "room from above; shaded: two LEDs seen")),
+        (
+            True,
+            (
+                "rays along the pixel line: exact; dashed: paraxial",
+                "room, paraxial; shaded: two LEDs seen",
+            ),
+        ),
+    ):
+        put(shared, SETTINGS, exact=exact)
+        assert drawing._optics.get_title(loc="left") == titles[0]
+        assert drawing._room.get_title(loc="left") == titles[1]
+        # each over its own axes
+        right = drawing._optics.get_window_extent().x1
+        ends = [title.get_window_extent().x1 for title in drawing._titles]
+        assert ends[0] < right < drawing._room.get_window_extent().x0
+        assert ends[1] <= drawing.figure.bbox.x1
+
+
+@pytest.mark.parametrize("axis_off", [0.0, 20.0])
+def test_weak_lenses_are_nearly_paraxial(axis_off: float) -> None:
+    explorer = Explorer("LJ1516L1", "LJ1516L1", sensor_dist=400.0, axis_off=axis_off, exact=True)
+    drawing, view = explorer._drawing, explorer.view()
+    for exact, paraxial, colour in zip(drawing._exact, drawing._rays, RAYS, strict=True):
+        z, heights = (np.asarray(values, float) for values in exact.get_data())
+        dashed = np.asarray(paraxial.get_ydata(), float)
+        # both start together
+        assert_allclose([z[0], heights[0], dashed[0]], [-2000, axis_off, axis_off], atol=1e-9)
+        assert_allclose([z[1], heights[1]], [0, dashed[1]], atol=1e-9)
+        assert z[-1] == pytest.approx(view.system.length + 500)
+        assert_allclose(heights[-1], dashed[-1], atol=0.1)
+        assert exact.get_color() == paraxial.get_color() == colour
+        assert paraxial.get_linestyle() == "--"
+        assert paraxial.get_linewidth() < exact.get_linewidth()
+    edges = [float(np.asarray(line.get_ydata())[1]) for line in drawing._exact]
+    assert edges[0] == -edges[2] == pytest.approx(0.95 * 15)
+
+
+def test_lost_rays_end_where_they_are_lost() -> None:
+    explorer = Explorer(axis_off=900.0, exact=True)
+    drawing, view = explorer._drawing, explorer.view()
+    z, height, lost = view.exact_rays()
+    assert 0 < lost.sum() < len(lost)
+    assert_array_equal(drawing._lost.get_xdata(), z[-1, lost])
+    assert_array_equal(drawing._lost.get_ydata(), height[-1, lost])
+    assert z[-1, lost].max() <= view.system.length
+    # the steep edge meets the curved side of the first lens at more than the critical angle
+    assert lost[0]
+    first = view.system.elements[0].surfaces()[1]
+    assert abs(height[-1, 0]) < 15
+    assert z[-1, 0] == pytest.approx(first.z + float(first.sag(height[-1, 0], 0.0)))
+    assert_allclose(z[-1, ~lost], view.system.length + 1.25 * view.sensor_dist)
+
+
+@pytest.mark.parametrize(
+    ("changed", "quantity", "text"),
+    [
+        ({"axis_off": 3000.0}, "image, median", "mm, off the sensor"),
+        ({"axis_off": 3000.0}, "light on the sensor", "0.0 % of all, 0.0 % of what arrives"),
+        # so near that the light leaves diverging
+        (
+            {"front": "LJ1516L1", "back": "LJ1516L1", "source_dist": 200.0, "axis_off": 1.0},
+            "image, median",
+            "pixel",
+        ),
+        ({"sensor_dist": 5.0}, "image, median", "pixel"),
+        ({"gap": 10.0, "axis_off": 0.0}, "median − paraxial", "+0.0 px"),
+    ],
+)
+def test_odd_settings(shared: Explorer, changed: dict[str, Any], quantity: str, text: str) -> None:
+    put(shared, {**SETTINGS, **changed}, exact=True)
+    assert text in shared.view().exact_results()[quantity]
+    assert shared.error.value == ""
+
+
+def test_where_no_light_arrives_the_table_says_so(shared: Explorer) -> None:
+    """Total reflection at the first curved side, and past the second lens."""
+    steep = {"front": "PCX_30_32_50", "back": "PCX_30_32_50", "gap": 3.0}
+    put(shared, {**SETTINGS, **steep, "source_dist": 200.0, "axis_off": 450.0}, exact=True)
+    results = shared.view().exact_results()
+    assert results["image, median"] == results["image, peak"] == "no light arrives"
+    assert results["median − paraxial"] == results["80 % of the light in"] == "–"
+    assert results["light on the sensor"] == "0.0 % of all, 0.0 % of what arrives"
+    assert results["light lost"] == "100.0 % on the way, 0.0 % reflected"
+    assert shared.view().exact_rays()[2].all()
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    front=st.sampled_from(Explorer().front.options),
+    back=st.sampled_from(Explorer().front.options),
+    gap=st.floats(0, 10),
+    sensor_dist=st.none() | st.floats(5, 600),
+    source_dist=st.floats(200, 6000),
+    axis_off=st.floats(-3000, 3000),
+    led_spacing=st.floats(100, 2000),
+)
+def test_whatever_the_sliders_say_is_shown(shared: Explorer, **changed: Any) -> None:
+    put(shared, changed, exact=True)
+    assert shared.error.value == ""
+    results = shared.view().exact_results()
+    assert not any("nan" in value or "inf" in value for value in results.values())
+    lost, faded = (float(part.split(" %")[0]) for part in results["light lost"].split(", "))
+    useful, on_sensor = (
+        float(part.split(" %")[0]) for part in results["light on the sensor"].split(", ")
+    )
+    assert 0 <= useful <= on_sensor <= 100
+    assert lost + faded + useful <= 100.2  # each is rounded
+    if results["image, median"] == "no light arrives":
+        assert shared.view().exact_rays()[2].all()
+        assert (lost, useful) == (100, 0)
+        return
+    narrow, wide = (
+        float(results[f"{share} % of the light in"].removesuffix(" px")) for share in (50, 80)
+    )
+    assert 0 <= narrow <= wide
+
+
+def test_without_numba_the_switch_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    explorer = Explorer()
+    picture, readout = explorer.picture.value, explorer.readout.value
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "numba", None)
+        without.delitem(sys.modules, "raytransfer._kernels", raising=False)
+        without.delattr(raytransfer, "_kernels", raising=False)
+        with pytest.raises(ModuleNotFoundError, match=r"linetrack\[exact\]"):
+            explorer.exact.value = True
+        assert "pip install linetrack[exact]" in explorer.error.value
+        assert "Traceback" not in explorer.error.value
+        assert not explorer.exact.value
+        assert (explorer.picture.value, explorer.readout.value) == (picture, readout)
+        explorer.source_dist.value = 2500.0  # what is paraxial goes on
+        assert explorer.error.value == ""
+        with pytest.raises(ModuleNotFoundError, match="numba"):
+            Explorer(exact=True)
+    explorer.exact.value = True
+    assert explorer.error.value == ""
 
 
 # --- errors ---------------------------------------------------------------------------------
