@@ -1,4 +1,4 @@
-# make setup | run | test | lab | bench | notebooks | soak | flash | lint | lock | clean
+# make setup | run | test | lab | bench | agreement | notebooks | soak | flash | lint | lock | clean
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -7,7 +7,7 @@ BENCH := .venv-bench
 BENCH_STAMP := $(BENCH)/.complete
 INPUTS := environment.txt constraints.txt pyproject.toml
 
-.PHONY: help setup build run test lint lab notebooks bench soak flash lock clean
+.PHONY: help setup build run test lint lab notebooks bench agreement soak flash lock clean
 
 help:
 	@echo "make setup      build $(VENV) from environment.txt, install the project, compile firmware and twin"
@@ -16,6 +16,7 @@ help:
 	@echo "make lab        open the notebooks in JupyterLab"
 	@echo "make notebooks  execute the notebooks again, in place, byte-reproducibly"
 	@echo "make bench      speed, beside other packages; table and build/bench.json"
+	@echo "make agreement  exact rays beside two other tracers, ray by ray"
 	@echo "make soak       faults on the twin's link, many more than make test tries"
 	@echo "make flash      copy the firmware to a Nucleo that is plugged in"
 
@@ -74,6 +75,9 @@ $(BENCH_STAMP): $(INPUTS) benchmarks/peers.txt
 
 bench: $(BENCH_STAMP) build
 	$(BENCH)/bin/python -m benchmarks
+
+agreement: $(BENCH_STAMP)
+	$(BENCH)/bin/python -W ignore -m benchmarks.agreement
 
 soak: setup
 	$(BIN)/python -m tests.twin.soak

@@ -72,14 +72,22 @@ def arriving_rays(
     return np.concatenate(positions, axis=1), np.concatenate(directions, axis=1)
 
 
+def _over(
+    system: OpticalSystem, position: Array, direction: Array, **options: Any
+) -> Callable[[], object]:
+    """Trace into the same memory each time, as others change their rays in place."""
+    place = trace(system, position, direction)
+    return lambda: trace(system, position, direction, out=place, **options)
+
+
 def _alone(pair: OpticalSystem, position: Array, direction: Array) -> list[Result]:
     numbers = position.reshape(-1)
     limit = np.empty(COUNT)
     one, two, fresnel, bound = interleaved(
         ROUNDS,
-        seconds(lambda: trace(pair, position, direction, fresnel=False, threads=1)),
-        seconds(lambda: trace(pair, position, direction, fresnel=False, threads=2)),
-        seconds(lambda: trace(pair, position, direction, threads=1)),
+        seconds(_over(pair, position, direction, fresnel=False, threads=1)),
+        seconds(_over(pair, position, direction, fresnel=False, threads=2)),
+        seconds(_over(pair, position, direction, threads=1)),
         seconds(lambda: _roots_and_divisions(numbers, limit)),
     )
     return [
@@ -121,7 +129,7 @@ def _beside_numpy(pair: OpticalSystem, position: Array, direction: Array) -> lis
     require_same("numpy", np.concatenate(blocks(), axis=1), (ours.x, ours.y), 1e-10)
     compiled, plain = interleaved(
         ROUNDS,
-        seconds(lambda: trace(pair, position, direction, fresnel=False, threads=1)),
+        seconds(_over(pair, position, direction, fresnel=False, threads=1)),
         seconds(blocks),
     )
     return [Result("trace / numpy in blocks", "×", ratios(plain, compiled), target=5)]
@@ -166,8 +174,8 @@ def _beside_optiland(pair: OpticalSystem, position: Array, direction: Array) -> 
     require_same("optiland", (rays.x, rays.y, rays.i > 0), (ours.x, ours.y, ours.arrived))
     one, every, theirs = interleaved(
         ROUNDS,
-        seconds(lambda: trace(pair, position, direction, fresnel=False, threads=1)),
-        seconds(lambda: trace(pair, position, direction, fresnel=False)),
+        seconds(_over(pair, position, direction, fresnel=False, threads=1)),
+        seconds(_over(pair, position, direction, fresnel=False)),
         lambda: traced()[0],
     )
     return [
@@ -213,19 +221,13 @@ def _beside_batoid(rng: np.random.Generator) -> list[Result]:
     for threads, words in ((1, "one thread"), (2, "two threads")):
         compiled, theirs = interleaved(
             ROUNDS,
-            seconds(_spheres(pair, position, direction, threads)),
+            seconds(_over(pair, position, direction, fresnel=False, threads=threads)),
             lambda threads=threads: traced(threads)[0],  # type: ignore[misc]
         )
         results.append(
             Result(f"trace, spheres / batoid, {words}", "×", ratios(theirs, compiled), target=10)
         )
     return results
-
-
-def _spheres(
-    pair: OpticalSystem, position: Array, direction: Array, threads: int
-) -> Callable[[], object]:
-    return lambda: trace(pair, position, direction, fresnel=False, threads=threads)
 
 
 def spherical_pair() -> OpticalSystem:
