@@ -343,3 +343,14 @@ def test_the_search_is_the_same_with_an_executor() -> None:
         assert search(DARK, executor=executor, **budget) == alone
     assert len(alone) == 1
     assert alone[0].worst == worst_bounds(alone[0].head.system(), DARK)
+
+
+def test_the_narrow_head_is_the_better_one_with_a_narrow_slit() -> None:
+    """Its spikes at 4.15 m are 14 px wide or less."""
+    narrow = replace(BETTER, slit=6.0, pair_to_window=26.9)
+    assert DESIGNS["slit-6mm"].system == narrow.system()
+    scene = Scene()
+    x = 4150 * np.tan(np.radians([0, 11, 22]))
+    light = spikes(narrow.system(), scene, x, [4150.0] * 3).electrons
+    for row in light:
+        assert np.ptp(np.flatnonzero(row > row.max() / 2)) + 1 <= 14
