@@ -27,9 +27,15 @@ def number(name: str, value: Any, hint: str = "") -> float:
         value = value[()]
     if isinstance(value, bool | np.bool_) or not isinstance(value, Real):
         raise TypeError(f"{name} = {value!r}: a single real number is needed{_because(hint)}")
-    if not math.isfinite(value):
+    try:
+        result = float(value)
+    except OverflowError:
+        raise ValueError(
+            f"{name} is a whole number beyond all floating-point ones{_because(hint)}"
+        ) from None
+    if not math.isfinite(result):
         raise ValueError(f"{name} = {value}: allowed are finite numbers{_because(hint)}")
-    return float(value)
+    return result
 
 
 def positive(name: str, value: Any, hint: str = "") -> float:

@@ -21,7 +21,19 @@ MISSED, BLOCKED, REFLECTED = 1.0, 2.0, 3.0
 
 TINY = 1e-100  # as in tracing
 
-_compile = njit(cache=True, error_model="numpy", fastmath={"contract"}, nogil=True)
+
+def _cacheable() -> bool:
+    """Whether compiled code can be kept: beside this file, or in the user's home."""
+    try:
+        njit(cache=True)(_cacheable)
+    except RuntimeError:  # neither can be written: each process compiles anew
+        return False
+    return True
+
+
+CACHE = _cacheable()
+
+_compile = njit(cache=CACHE, error_model="numpy", fastmath={"contract"}, nogil=True)
 
 
 @_compile
@@ -40,14 +52,16 @@ def _turn(b, step):
 
 @_compile
 def _to_plane(b, x, y, z, code):
-    """Shift the origin, then advance to z = 0; a ray that does not go there is lost."""
+    """Shift the origin, then advance to z = 0; a ray that does not go there stays, and is lost."""
     for i in range(BLOCK):
         dz = b[DZ + i]
         ahead = dz > TINY
-        t = -(b[Z + i] + z) / (dz if ahead else 1.0)
+        height = b[Z + i] + z
+        t = -height / (dz if ahead else 1.0)
+        t = t if ahead else 0.0
         b[X + i] += x + t * b[DX + i]
         b[Y + i] += y + t * b[DY + i]
-        b[Z + i] = 0.0
+        b[Z + i] = 0.0 if ahead else height
         old = b[LOST + i]
         b[LOST + i] = old if (old != 0.0) | ahead else code + MISSED
 
@@ -168,7 +182,7 @@ _plane_fresnel, _curved_fresnel = _refraction(fresnel=True, circle=False)
 _plane_fresnel_round, _curved_fresnel_round = _refraction(fresnel=True, circle=True)
 
 
-@njit(cache=True, fastmath={"contract", "reassoc"}, nogil=True)
+@njit(cache=CACHE, fastmath={"contract", "reassoc"}, nogil=True)
 def _sum(values, count):
     """Add up the first values; always in the same order."""
     total = 0.0
@@ -247,10 +261,11 @@ def _save(values, row, lost):
 
 @_compile
 def _save_losses(status, surface, lost):
+    """Take LOST apart: the reason, and the surface or −1."""
     for i in range(len(status)):
-        code = np.int32(lost[i])
-        status[i] = code & 3
-        surface[i] = (code >> 2) if code != 0 else -1
+        behind = np.floor(lost[i] * 0.25)  # in doubles: quicker than with integers
+        status[i] = np.uint8(np.int32(lost[i] - 4.0 * behind))
+        surface[i] = np.int16(np.int32(behind if lost[i] != 0.0 else -1.0))
 
 
 @_compile
@@ -271,7 +286,7 @@ def _normalise(b, doubtful, front):
         doubtful[i] = 0.0 if usual else 1.0
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"}, nogil=True, parallel=True)
+@njit(cache=CACHE, error_model="numpy", fastmath={"contract"}, nogil=True, parallel=True)
 def trace(
     position, direction, front, steps, turned, shapes, indices, edges, fresnel, out, status, surface
 ):
@@ -310,8 +325,8 @@ def _emit(b, first, count, ny, source, grid, lobe, facing):
     """Rays `first` to `first + count` of a point source, row after row of each column, from z = 0.
 
     grid is (low x, step x, low y, step y) on that plane. W becomes radiant intensity × solid angle;
-    the intensity is 1, or by the cosine to `facing` from a table over 0 to 1. Rays beyond `count`
-    carry nothing.
+    the intensity is 1, or by the cosine to `facing` from a table over √(1 − cosine) from 0 to 1.
+    Rays beyond `count` carry nothing.
     """
     column = first // ny
     row = first - column * ny
@@ -342,7 +357,7 @@ def _emit(b, first, count, ny, source, grid, lobe, facing):
     if last > 0:
         for i in range(BLOCK):
             cosine = b[DX + i] * facing[0] + b[DY + i] * facing[1] + b[DZ + i] * facing[2]
-            at = max(cosine, 0.0) * last
+            at = np.sqrt(max(1.0 - cosine, 0.0)) * last
             k = min(int(at), last - 1)
             b[W + i] *= (lobe[k] + (at - k) * (lobe[k + 1] - lobe[k])) * (cosine > 0.0)
     for i in range(count, BLOCK):
@@ -449,7 +464,7 @@ def _spread(pixels, power, middle, width, pitch):
 STRIPS = 256
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"}, nogil=True, parallel=True)
+@njit(cache=CACHE, error_model="numpy", fastmath={"contract"}, nogil=True, parallel=True)
 def illuminate(
     nx, ny, source, grid, lobe, facing,
     steps, turned, shapes, indices, edges, fresnel,

@@ -318,7 +318,7 @@ class LightTable:
         self.sensor = sensor
         self.wavelength = check.positive("wavelength", wavelength, "wavelengths are in µm")
         self._parts = prescription(system, wavelength)
-        self._kernels = load_kernels()
+        load_kernels()  # refuses now what cannot be traced later
         self._nodes: OrderedDict[tuple[int, int, int], NDArray[np.float64]] = OrderedDict()
         self._cells: OrderedDict[tuple[int, int, int], NDArray[np.float64] | None] = OrderedDict()
 
@@ -335,6 +335,8 @@ class LightTable:
         ndarray, shape (pixels,)
         """
         x, y, distance = position
+        if not math.isfinite(x + y + distance):
+            check_source(position)  # says which; on its own it would take a tenth of the time
         pixels = np.zeros(self.sensor.pixels)
         if distance <= 0:
             return pixels
@@ -356,7 +358,7 @@ class LightTable:
         weights = [_cubic(value - start) for value, start in zip(at, first, strict=True)]
         along = np.multiply.outer(np.multiply.outer(weights[0], weights[1]), weights[2]).ravel()
         columns = (along @ cell).reshape(3, -1)
-        self._kernels.lay(columns, 1 / distance**2, self.sensor.pitch, pixels)
+        load_kernels().lay(columns, 1 / distance**2, self.sensor.pitch, pixels)
         return pixels
 
     def _cell(self, first: tuple[int, int, int]) -> NDArray[np.float64] | None:
@@ -431,7 +433,7 @@ class LightTable:
         low_x, high_x, low_y, high_y = area
         grid = np.array([low_x, (high_x - low_x) / nx, low_y, (high_y - low_y) / ny])
         columns = np.empty((3, nx))
-        rows = self._kernels.columns_of(
+        rows = load_kernels().columns_of(
             nx, ny, np.array(position), grid, *self._parts, self.sensor.pixel_height / 2, columns
         )
         return columns, rows

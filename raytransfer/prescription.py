@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from raytransfer.materials import D_LINE
+from raytransfer.sources import check_wavelength
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -42,6 +43,7 @@ class Prescription(NamedTuple):
 
 def prescription(system: OpticalSystem, wavelength: float = D_LINE) -> Prescription:
     """Lay out a system's surfaces for a wavelength in µm."""
+    check_wavelength("wavelength", wavelength)  # a constant index would take any
     frames = surface_frames(system)
     rotation, origin = np.eye(3), np.zeros(3)
     steps = []

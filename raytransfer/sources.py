@@ -252,10 +252,13 @@ class Lobe:
         return np.asarray(np.where(cosine >= 0, value, 0.0) / (2 * math.pi * turned.sum()))
 
     def table(self, n: int) -> NDArray[np.float64]:
-        """Return the intensity at n cosines, evenly from 0 to 1, shape (n,), W/sr per W."""
+        """Return the intensity at cosines 1 − u², u evenly from 0 to 1, shape (n,), W/sr per W.
+
+        Near the axis u is the angle over √2: narrow lobes are as well resolved as wide ones.
+        """
         if check.whole("n", n) < 2:
             raise ValueError(f"n = {n}: a table has 2 values or more")
-        return self.intensity(np.linspace(0.0, 1.0, n))
+        return self.intensity(1 - np.linspace(0.0, 1.0, n) ** 2)
 
 
 RED = Spectrum.line(0.63)

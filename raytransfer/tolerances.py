@@ -352,9 +352,8 @@ def _contact(
 PIECES = 40
 """Into so many an executor's work is divided: what is lost of a study that stops is in pieces."""
 
-
-PARTS = 8
-"""Into so many a pixel is divided to find a spike's median and width."""
+FINE = 8
+"""Parts of a pixel in which light is collected to find a spike's median and width."""
 
 
 class Failure(NamedTuple):
@@ -496,6 +495,10 @@ class Interrupted(KeyboardInterrupt):
         super().__init__(f"{len(study.values)} samples were done; they are in .study")
         self.study = study
 
+    def __reduce__(self) -> tuple[type[Interrupted], tuple[ToleranceStudy]]:
+        """Pickle what it was made of: a study may itself run in another process."""
+        return Interrupted, (self.study,)
+
 
 class ExecutorError(RuntimeError):
     """A study whose executor failed; `study` has the samples that were done."""
@@ -506,7 +509,11 @@ class ExecutorError(RuntimeError):
             "a metric that pickle can find by its name, and are spawned, not forked: a fork of a "
             "process that has traced rays cannot trace"
         )
-        self.study = study
+        self.study, self.reason = study, reason
+
+    def __reduce__(self) -> tuple[type[ExecutorError], tuple[ToleranceStudy, str]]:
+        """Pickle what it was made of."""
+        return ExecutorError, (self.study, self.reason)
 
 
 class _Sample(NamedTuple):
@@ -738,7 +745,7 @@ def spike(
         If none of its light falls on the pixels.
     """
     # one thread: it is the studies that run in parallel
-    fine = replace(sensor, pixels=sensor.pixels * PARTS, pitch=sensor.pitch / PARTS)
+    fine = replace(sensor, pixels=sensor.pixels * FINE, pitch=sensor.pitch / FINE)
     light = pixel_response(system, position, fine, wavelength=wavelength, rays=rays, threads=1)
     if not light.any():
         raise ValueError(
@@ -747,7 +754,7 @@ def spike(
         )
     below = np.concatenate([[0.0], np.cumsum(light)])
     below /= below[-1]
-    edges = (np.arange(len(below)) - len(light) / 2) / PARTS
+    edges = (np.arange(len(below)) - len(light) / 2) / FINE
     begin = np.linspace(0.0, 0.2, 401)
     widths = np.interp(begin + 0.8, below, edges) - np.interp(begin, below, edges)
     return Spike(

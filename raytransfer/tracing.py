@@ -6,6 +6,7 @@ every surface, edges of glass absorb, and light that is reflected is lost: there
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -275,11 +276,12 @@ def front_opening(
     low, high = np.full(2, -np.inf), np.full(2, np.inf)
     frames = surface_frames(system)
     glass, _, place = next((f for f in frames if not f[0].screen), frames[-1])
-    # where a screen has no edge, light that reaches the first glass passes within
-    slope = (np.abs(source[:2]) + np.minimum(glass.half, 1e4)) / distance
-    within = np.minimum(glass.half, 1e4) + 2 * slope * (abs(place[2]) + 10) + 1
+    # where a screen has no edge, light that reaches the first glass passes within, however rolled
+    reach = math.hypot(*np.minimum(glass.half, 1e4)) + math.hypot(*place[:2])
+    slope = (math.hypot(x, y) + reach) / distance
+    reach += 2 * slope * (abs(place[2]) + 10) + 1
     for surface, rotation, origin in frames:
-        limits = np.minimum(surface.half, within)
+        limits = np.minimum(surface.half, reach + math.hypot(*origin[:2]))
         corners = np.array([[i, j] for i in (-1, 1) for j in (-1, 1)]).T * limits[:, None]
         depths = {0.0, surface.depth(surface.half)}
         points = np.concatenate([np.vstack([corners, np.full(4, z)]) for z in depths], axis=1)

@@ -111,6 +111,7 @@ def test_shipped_files_are_as_they_would_be_written(name: str) -> None:
         ("gaps = [2.63, ", "gaps = [-2.63, ", "gap between PCV_15_30_20 and .* allowed is >= 0"),
         ("gaps = [2.63, ", "gaps = [", "4 gaps between them, not 3"),
         ("gaps = [2.63, ", "gaps = ['2.63', ", r"gaps\[0\] = '2.63': a single real number"),
+        ("0.82", "1" + 400 * "0", "sensor_distance is a whole number beyond all"),
         ("0.82", "nan", "sensor_distance = nan: allowed are finite"),
         ("0.82", "inf", "sensor_distance = inf: allowed are finite"),
         ("reversed = true", "reversed = 1", "element 2, reversed = 1: true or false is needed"),

@@ -3,6 +3,7 @@
 import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,9 +11,10 @@ import pytest
 from scipy.special import erf  # type: ignore[import-untyped]
 
 from raytransfer import TCD1304, OpticalSystem, heads, prototype_head
-from raytransfer.designs import DESIGNS
+from raytransfer.designs import DESIGNS, load_design
 from raytransfer.heads import (
     BETTER,
+    Candidate,
     Head,
     Layout,
     Scene,
@@ -122,7 +124,7 @@ SOURCES = np.array(
 
 
 @pytest.mark.parametrize(
-    ("system", "agreement"), [(THESIS, 0.3), (SLIT.system(), 0.03)], ids=["thesis", "slit"]
+    ("system", "agreement"), [(THESIS, 0.05), (SLIT.system(), 0.02)], ids=["thesis", "slit"]
 )
 def test_the_quick_model_agrees_with_rays(system: OpticalSystem, agreement: float) -> None:
     """In the wide-open head 96 columns are few for a caustic's edge."""
@@ -134,6 +136,32 @@ def test_the_quick_model_agrees_with_rays(system: OpticalSystem, agreement: floa
     bounds = led_bounds(system, DARK, *SOURCES.T)
     exact_bounds = led_bounds(system, DARK, *SOURCES.T, rays=(384, 128))
     assert bounds == pytest.approx(exact_bounds, rel=agreement)
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        Placement((0.0, 0.05)),
+        Placement(tilt=(0.01, 0.0, 0.0)),
+        Placement(tilt=(0.0, 0.0, 0.02)),
+    ],
+)
+@pytest.mark.parametrize("part", ["sensor", "lens"])
+def test_a_head_off_the_plane_of_the_axis_is_traced_in_full(place: Placement, part: str) -> None:
+    system = SLIT.system()
+    if part == "sensor":
+        off = replace(system, sensor_placement=place)
+    else:
+        off = replace(system, placements=(Placement(), Placement(), place, *[Placement()] * 3))
+    quick = spikes(off, DARK, *SOURCES[:2].T)
+    exact = spikes(off, DARK, *SOURCES[:2].T, rays=RAYS)
+    np.testing.assert_array_equal(quick.electrons, exact.electrons)
+    np.testing.assert_array_equal(quick.slope, exact.slope)
+    # along the line nothing of the symmetry is lost
+    along = replace(system, sensor_placement=Placement((0.1, 0.0), (0.0, 0.01, 0.0)))
+    assert spikes(along, DARK, *SOURCES[1:2].T).electrons.sum() == pytest.approx(
+        spikes(along, DARK, *SOURCES[1:2].T, rays=RAYS).electrons.sum(), rel=0.01
+    )
 
 
 def test_electrons_are_those_of_the_irradiance() -> None:
@@ -291,6 +319,13 @@ def test_impossible_scenes_are_refused(changes: dict[str, Any], message: str) ->
         Scene(**changes)
 
 
+def test_a_scene_has_an_emitter_and_noise() -> None:
+    with pytest.raises(TypeError, match=r"emitter = 0.25: of kind Emitter"):
+        Scene(emitter=0.25)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"noise = 60: of kind Noise"):
+        Scene(noise=60)  # type: ignore[arg-type]
+
+
 # the search -------------------------------------------------------------------------------------
 
 
@@ -343,6 +378,67 @@ def test_the_search_is_the_same_with_an_executor() -> None:
         assert search(DARK, executor=executor, **budget) == alone
     assert len(alone) == 1
     assert alone[0].worst == worst_bounds(alone[0].head.system(), DARK)
+
+
+BEFORE = Layout("LJ1430L1", "LJ1430L1", True, False, "before", True)
+TOO_SHORT = Layout("PCX_15_30_20", "PCX_15_30_20", True, False, "before", True)
+"""Focuses within its own glass."""
+
+
+def test_what_cannot_be_searched_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"samples = 4: allowed is >= 5"):
+        search(DARK, choices=[BEFORE], samples=4)
+    with pytest.raises(ValueError, match=r"bounds of \(inf, inf\) mm.*ambient = 5000 lx"):
+        search(replace(SCENE, ambient=5000.0), choices=[BEFORE], samples=5)
+    with pytest.raises(ValueError, match="none of 1 layouts with 5 samples"):
+        search(DARK, choices=[TOO_SHORT], samples=5, refine=1, rounds=1)
+    with pytest.raises(ValueError, match="back = 'LJ143': known are"):
+        replace(BEFORE, back="LJ143")
+    with pytest.raises(ValueError, match="slit_place = 'inside': allowed are"):
+        replace(BEFORE, slit_place="inside")  # type: ignore[arg-type]
+
+
+def test_a_layout_that_cannot_be_built_ends_no_search() -> None:
+    found = search(DARK, choices=[TOO_SHORT, BEFORE], samples=6, refine=2, rounds=1)
+    assert [candidate.head.front for candidate in found] == ["LJ1430L1"]
+
+
+def test_lengths_are_rounded_unless_parts_then_overlap(monkeypatch: pytest.MonkeyPatch) -> None:
+    budget: dict[str, Any] = {"choices": [BEFORE], "samples": 8, "refine": 1, "rounds": 1}
+    (rounded,) = search(DARK, **budget)
+    gap = rounded.head.gap / 0.05
+    assert gap == pytest.approx(round(gap), abs=1e-6)
+    assert heads._rounded(rounded.head) == rounded.head
+    monkeypatch.setattr(heads, "_rounded", lambda head: replace(head, slit_distance=7.0))
+    (kept,) = search(DARK, **budget)
+    assert kept.head.system().length > 0
+    assert kept.head.slit_distance != 7.0
+    assert kept.head.gap == pytest.approx(rounded.head.gap, abs=0.026)
+
+
+def test_the_command_saves_the_best(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked: dict[str, Any] = {}
+
+    def found(_: Scene, **options: Any) -> list[Candidate]:
+        asked.update(options)
+        return [Candidate(BETTER, (0.01, 0.08), 1.6), Candidate(SLIT, (0.02, 0.09), 1.2)]
+
+    monkeypatch.setattr(heads, "search", found)
+    path = tmp_path / "best.toml"
+    assert heads.main(["--save", str(path), "--samples", "7", "--seed", "3"]) == 0
+    assert (asked["samples"], asked["seed"], asked["refine"], asked["rounds"]) == (7, 3, 8, 20)
+    assert "1.60  0.0100, 0.0800  front=LJ1695L1, back=LJ1567L1" in capsys.readouterr().out
+    design = load_design(path)
+    assert design.system == BETTER.system()
+    assert "0.0100 at 1300 mm, 0.0800 at 4150 mm" in design.notes
+    asked.clear()
+    for wrong in (tmp_path / "best.txt", tmp_path / "nowhere" / "best.toml"):
+        with pytest.raises(SystemExit):
+            heads.main(["--save", str(wrong)])
+        assert "a .toml file in a folder that exists" in capsys.readouterr().err
+    assert not asked  # not after minutes
 
 
 def test_the_narrow_head_is_the_better_one_with_a_narrow_slit() -> None:

@@ -11,7 +11,7 @@ import pytest
 
 import raytransfer
 
-HEAVY = ["sympy", "matplotlib", "scipy", "IPython", "ipywidgets", "pandas", "traitlets"]
+HEAVY = ["numba", "sympy", "matplotlib", "scipy", "IPython", "ipywidgets", "pandas", "traitlets"]
 
 
 def run(code: str) -> str:
@@ -41,6 +41,10 @@ claims()
 rt.cast_rays(30, rt.telecentric_pair().matrix("x"), 5000, 0)
 print([name for name in heavy if name in sys.modules])
 
+# nor do the modules of exact light, before they trace
+from raytransfer import analysis, designs, irradiance, outdoors, reference, tolerances, tracing
+print([name for name in heavy if name in sys.modules])
+
 # a figure loads matplotlib, but nothing else
 ax = rt.plot_ray_cast(30, 11.8, rt.telecentric_pair().matrix("x"), 200, 50)
 print(len(ax.lines) >= 3, rt.plot_ray_cast is raytransfer.plots.plot_ray_cast)
@@ -52,10 +56,22 @@ print(type(rt.trans_mat(sympy.Symbol("d"))).__name__)
     assert run(code).splitlines() == [
         "[]",
         "[]",
+        "[]",
         "True True",
         "['matplotlib']",
         "FreeSpace",
     ]
+
+
+def test_kernels_are_compiled_where_nothing_can_be_written() -> None:
+    """An installation without write access, and a user without a home: no cache, but light."""
+    code = """
+from numba.core.caching import CacheImpl
+CacheImpl._locator_classes = []
+from raytransfer import _kernels
+print(_kernels.CACHE, _kernels._sum(_kernels.np.ones(3), 3))
+"""
+    assert run(code).split() == ["False", "3.0"]
 
 
 def test_star_import_has_every_name() -> None:

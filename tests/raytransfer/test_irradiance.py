@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 from functools import cache
 from typing import TYPE_CHECKING
@@ -234,6 +235,25 @@ def test_where_the_emitter_faces_counts() -> None:
     assert 20 < at_it / bare.electrons.sum() < 60
 
 
+@pytest.mark.parametrize("degrees", [1, 3, 30])
+def test_narrow_lobes_are_resolved(degrees: float) -> None:
+    """Turned aside by half of where it ends, a lobe that falls linearly gives half its light."""
+    lobe = Lobe.measured(np.radians([0, degrees]), [1, 0])
+    angle = np.radians(degrees / 2)
+    place = (0.0, 0.0, 30_000.0)  # so far away that all rays are at one angle
+    light = irradiance(
+        SLIT,
+        Emitter(lobe=lobe),
+        place,
+        integration_time=1e-3,
+        rays=(64, 64),
+        facing=(np.sin(angle), 0.0, np.cos(angle)),
+    )
+    response = pixel_response(SLIT, place, wavelength=RED, rays=(64, 64))
+    joule = 0.25e-3 * response.sum() * float(lobe.intensity(1.0)) / 2
+    assert light.budget.on_pixels == pytest.approx(joule, rel=2e-3)
+
+
 def test_a_spectrum_is_the_sum_of_its_lines() -> None:
     position = (200.0, 0.0, 1300.0)
     white = Spectrum((0.45, 0.55, 0.65), (1.0, 2.0, 1.0))
@@ -337,6 +357,21 @@ def test_the_table_is_dark_where_no_light_comes_and_traces_where_it_cannot_inter
     assert totals == pytest.approx(
         exact, abs=2e-3 * pixel_response(HEAD, (0, 0, 1000), wavelength=RED).sum()
     )
+
+
+def test_the_table_can_be_sent_to_another_process() -> None:
+    table, place = TABLES["slit"], (123.0, 0.0, 1300.0)
+    copy = pickle.loads(pickle.dumps(table))  # noqa: S301
+    assert np.array_equal(copy.solid_angles(place), table.solid_angles(place))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_the_table_refuses_what_is_nowhere(bad: float) -> None:
+    for at in range(3):
+        place = [0.0, 0.0, 1000.0]
+        place[at] = bad
+        with pytest.raises(ValueError, match=rf"^position\[{at}\] = {bad}: allowed are finite"):
+            TABLES["head"].solid_angles((place[0], place[1], place[2]))
 
 
 def test_the_table_forgets_and_gives_the_same_again() -> None:

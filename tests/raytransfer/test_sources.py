@@ -121,7 +121,7 @@ def sphere_integral(lobe: Lobe) -> float:
 def test_lambert() -> None:
     lobe = Lobe.lambertian()
     assert_allclose(lobe.intensity([1, 0.5, 0, -0.3]), [1 / np.pi, 0.5 / np.pi, 0, 0], rtol=1e-15)
-    assert_allclose(lobe.table(5), np.linspace(0, 1, 5) / np.pi, rtol=1e-15)
+    assert_allclose(lobe.table(5), (1 - np.linspace(0, 1, 5) ** 2) / np.pi, rtol=1e-15)
     # within a cone of half-angle α: sin² α
     theta = (np.arange(10_000) + 0.5) / 10_000 * np.radians(30)
     cone = (lobe.intensity(np.cos(theta)) * np.sin(theta)).mean() * np.radians(30) * 2 * np.pi

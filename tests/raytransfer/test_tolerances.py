@@ -463,3 +463,12 @@ def test_studies_can_be_stored() -> None:
     study = monte_carlo(DOUBLET, planted, samples=3)
     again = pickle.loads(pickle.dumps(study))  # noqa: S301
     assert again.table() == study.table()
+
+
+def test_stopped_studies_can_be_sent_from_one_process_to_another() -> None:
+    study = monte_carlo(DOUBLET, planted, samples=3)
+    for stopped in (Interrupted(study), ExecutorError(study, "OSError: no workers")):
+        again = pickle.loads(pickle.dumps(stopped))  # noqa: S301
+        assert type(again) is type(stopped)
+        assert str(again) == str(stopped)
+        assert again.study.table() == study.table()

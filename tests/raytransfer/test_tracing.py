@@ -561,8 +561,10 @@ def test_the_colour_of_the_head_is_its_matrixs() -> None:
 
 
 def test_wavelengths_in_nm_are_refused() -> None:
-    with pytest.raises(ValueError, match="given in nm"):
-        trace(alone(CATALOGUE["LJ1430L1"]), *shot(), wavelength=630)
+    for lens in (CATALOGUE["LJ1430L1"], PCX):  # with dispersion and without
+        for tracer in (trace, reference.trace):
+            with pytest.raises(ValueError, match="given in nm"):
+                tracer(alone(lens), *shot(), wavelength=630)
 
 
 # --- Fresnel --------------------------------------------------------------------------------
@@ -732,6 +734,20 @@ def test_a_hollow_lens_is_found_from_any_distance(gap: float) -> None:
     assert_array_equal(np.where(one.arrived, -1, one.surface + 1), two.surface)
     assert_allclose(one.x, two.x, rtol=0, atol=1e-11)
     assert_allclose(one.y, two.y, rtol=0, atol=1e-11)
+
+
+def test_light_that_goes_backward_seen_from_a_tilted_lens() -> None:
+    """From within the hollow, and never to the plane of its vertex; against the reference."""
+    lens = alone(PCV, placements=(Placement(tilt=(0.3, 0.0, 0.5)),))
+    rotation = lens.places()[0][0]
+    x, y = (v.ravel() for v in np.meshgrid(np.linspace(-3, 3, 41), np.linspace(-1, 1, 41)))
+    toward = rotation @ np.stack([x, y, np.full(x.size, -0.05)])
+    toward = toward[:, toward[2] > 0]
+    start = (rotation @ [[0.5], [-0.5], [-1.5]]).repeat(toward.shape[1], axis=1)
+    found, expected = (tracer(lens, start, toward) for tracer in (trace, reference.trace))
+    assert_array_equal(found.status, expected.status)
+    assert_array_equal(found.surface, expected.surface)
+    assert {*found.surface.tolist()} == {0, 1}
 
 
 def test_a_half_cylinder_from_its_plane_side() -> None:
@@ -1051,6 +1067,7 @@ def test_bundles_are_in_order_and_through_the_middles() -> None:
 DEEP = SphericalLens("deep", 30.0, 16.0, math.inf, 12.0, GLASS)  # corners beyond the sphere
 TILTED = (Placement((0.5, -0.3), (0.1, -0.15, 0.3)),)
 SLIT = Aperture("slit", x=5.0)
+ROLLED, BACK = (Placement(tilt=(0.0, 0.0, roll)) for roll in (0.8, -0.8))
 
 
 @pytest.mark.parametrize(
@@ -1070,6 +1087,10 @@ SLIT = Aperture("slit", x=5.0)
         OpticalSystem("slit", (SLIT, *HEAD.elements), (9.0, *HEAD.gaps), 0.82),
         OpticalSystem("slit", (SLIT, PCX), (9.0,), 5.0, (TILTED[0], Placement())),
         OpticalSystem("two", (SLIT, Aperture("across", y=3.0), PCX), (9.0, 1.0), 5.0),
+        OpticalSystem(
+            "rolled", (SLIT, *PAIR.elements), (10.0, 0.2), 26.0, (ROLLED, *[Placement()] * 2)
+        ),
+        OpticalSystem("aside", (SLIT, PCX), (9.0,), 5.0, (BACK, Placement((9.0, 9.0)))),
     ],
     ids=lambda system: f"{system.name} {system.elements[0].part}",
 )
@@ -1077,7 +1098,7 @@ def test_every_ray_that_passes_the_front_is_in_the_bundle(system: OpticalSystem)
     """A grid far larger than any opening finds no ray outside, and the bundle is no larger."""
     front = next(k for k, (s, _, _) in enumerate(surface_frames(system)) if not s.screen)
     total = 0
-    for source in ((0.0, 0.0, 40.0), (60.0, -45.0, 45.0), (-400.0, 900.0, 3000.0)):
+    for source in ((0.0, 0.0, 40.0), (0.0, 0.0, 5e3), (60.0, -45.0, 45.0), (-400.0, 900.0, 3e3)):
         rays = bundle(system, source, 60, 60)
         low = rays.pupil.min(axis=1, keepdims=True)
         high = rays.pupil.max(axis=1, keepdims=True)
