@@ -472,15 +472,16 @@ def illuminate(
 ):  # fmt: skip
     """Light of a point source on the pixels: a cell of the pupil at a time, evenly over its image.
 
-    pixels : (pixels,), added to. account : (S + 1, 4) of power missed, blocked, totally reflected
-    and partly reflected at each surface; the last row is emitted, beside the line, beyond its ends.
+    pixels : (pixels,), added to. account : (S + 2, 4) of power missed, blocked, totally reflected
+    and partly reflected at each surface and at the sensor's plane; the last row is emitted, beside
+    the line, beyond its ends.
     """
     parts = (steps, turned, shapes, indices, edges)
     surfaces = len(shapes)
     width = max(1, max(16 * BLOCK // ny, (nx + STRIPS - 1) // STRIPS))
     strips = (nx + width - 1) // width
     each_pixels = np.zeros((strips, len(pixels)))
-    each_account = np.zeros((strips, surfaces + 1, 4))
+    each_account = np.zeros((strips, surfaces + 2, 4))
     for strip in prange(strips):
         b = np.empty(SIZE)
         mine = each_account[strip]
@@ -492,7 +493,7 @@ def illuminate(
         rays = np.empty((4, (columns + 2) * ny))
         rays[3] = 1.0
         own = rays[:, ny : (columns + 1) * ny]
-        mine[surfaces, 0] = _columns(
+        mine[surfaces + 1, 0] = _columns(
             first, columns, ny, source, grid, lobe, facing, parts, fresnel, b, own, reflected
         )
         if first > 0:
@@ -511,15 +512,15 @@ def illuminate(
                 weight = rays[2, at]
                 lost = int(rays[3, at])
                 if lost != 0:
-                    mine[min(lost >> 2, surfaces - 1), (lost & 3) - 1] += weight
+                    mine[lost >> 2, (lost & 3) - 1] += weight
                     continue
                 share, middle, beside, drift = _on_line(
                     rays, at, at - 1 if row > 0 else -1, at + 1 if row < ny - 1 else -1, half
                 )
-                mine[surfaces, 1] += weight * beside
+                mine[surfaces + 1, 1] += weight * beside
                 if share > 0.0:
                     slope = _slope(rays, 0, at, at - ny, at + ny)
-                    mine[surfaces, 2] += _spread(
+                    mine[surfaces + 1, 2] += _spread(
                         each_pixels[strip], weight * share, middle, abs(slope) + drift, pitch
                     )
         mine[:surfaces, 3] = reflected

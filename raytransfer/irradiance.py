@@ -33,8 +33,8 @@ SPEED_OF_LIGHT = 299792458.0  # m/s
 RAYS = (384, 128)
 """Columns and rows of the grid when nothing is said: 0.1 % of the peak, RMS, in the thesis's head."""
 
-DISC = 7
-"""Points along the line that stand for an extended source."""
+FEWEST_ROWS = 16
+"""With fewer rows of rays the pixel line is too thin to be met."""
 
 
 def photon_energy(wavelength: ArrayLike) -> NDArray[np.float64]:
@@ -53,7 +53,7 @@ class EnergyBudget:
     on_pixels, beside_line, beyond_ends : float
         On the pixels; on the sensor's plane above and below the line; beyond its ends.
     surfaces : tuple of str
-        Names of the S surfaces, front to back.
+        Names of the surfaces, front to back, and of the sensor's plane.
     missed, blocked, totally_reflected, reflected : tuple of float
         Lost at each surface: no intersection; outside the opening; total reflection; the part that
         Fresnel's equations reflect.
@@ -119,7 +119,8 @@ def irradiance(
     system : OpticalSystem
         With a sensor_distance.
     emitter : Emitter
-        An extended one is taken as `DISC` points along the line, weighted as the chords of a disc.
+        An extended one is taken as points along the line, weighted as the chords of a disc, with
+        images half a pixel apart or less.
     position : tuple of float
         X along the pixel line, Y up, and distance before the first vertex, mm.
     sensor : LineSensor
@@ -129,7 +130,8 @@ def irradiance(
     facing : tuple of float
         Direction of the emitter's axis in the frame of the system; straight at it when left out.
     rays : tuple of int
-        Columns along X and rows along Y of the grid over the front opening.
+        Columns along X and rows along Y of the grid over the front opening. An opening within the
+        head that is narrower than a row or column needs more.
     wavelengths : int
         How many stand for the spectrum.
     threads : int, optional
@@ -149,13 +151,15 @@ def irradiance(
         raise ValueError(f"facing = {facing}: a direction, X, Y and Z with the light")
     axis = axis / np.sqrt(axis @ axis)
     table = emitter.lobe.table(2049)
+    place = check_source(position)
+    points = disc_points(system, emitter.extent, place[2], sensor)
     electrons = np.zeros(sensor.pixels)
     on_pixels = np.zeros(sensor.pixels)
     account = 0.0
     for wavelength, share in zip(*emitter.spectrum.samples(wavelengths), strict=True):
-        for place, part in disc(check_source(position), emitter.extent):
+        for point, part in disc(place, emitter.extent, points):
             pixels, losses = _illuminate(
-                system, place, sensor, wavelength, rays, threads, table, axis
+                system, point, sensor, wavelength, rays, threads, table, axis
             )
             energy = emitter.power * time * share * part
             on_pixels += energy * pixels
@@ -203,15 +207,35 @@ def pixel_budget(
     return _budget(system, pixels, account)
 
 
+def disc_points(
+    system: OpticalSystem, extent: float, distance: float, sensor: LineSensor = TCD1304
+) -> int:
+    """Return how many points stand for a disc: their images are half a pixel apart or less.
+
+    Parameters
+    ----------
+    system : OpticalSystem
+    extent, distance : float
+        Diameter of the disc and its distance before the first vertex, mm.
+    sensor : LineSensor
+    """
+    focal_length = abs(system.effective_focal_length("x"))
+    if math.isinf(focal_length):  # a camera without lenses
+        focal_length = system.length + (system.sensor_distance or 0.0)
+    image = extent * focal_length / distance / sensor.pitch
+    # in the middle the nodes are π/2 times as far apart as on average
+    return max(7, math.ceil(math.pi * image)) if extent else 1
+
+
 def disc(
-    position: tuple[float, float, float], extent: float
+    position: tuple[float, float, float], extent: float, points: int
 ) -> list[tuple[tuple[float, float, float], float]]:
     """Points along the line that stand for a disc of a diameter in mm, and their shares."""
-    if extent == 0:
+    if points == 1:
         return [(position, 1.0)]
     # Gauss and Chebyshev's second rule: its weight is a disc's chord
-    angle = np.arange(1, DISC + 1) * np.pi / (DISC + 1)
-    shares = 2 / (DISC + 1) * np.sin(angle) ** 2
+    angle = np.arange(1, points + 1) * np.pi / (points + 1)
+    shares = 2 / (points + 1) * np.sin(angle) ** 2
     x, y, distance = position
     return [
         ((x + offset, y, distance), share)
@@ -235,12 +259,17 @@ def _illuminate(
     if system.sensor_distance is None:
         raise ValueError(f"{system.name}: sensor_distance is needed to say where light lands")
     nx, ny = (check.whole(f"rays[{i}]", number) for i, number in enumerate(rays))
+    if ny < FEWEST_ROWS:
+        raise ValueError(
+            f"rays = {rays}: allowed are {FEWEST_ROWS} rows or more, (columns, rows); the light on "
+            "the thin line of pixels is found between rows"
+        )
     kernels = load_kernels()
     low_x, high_x, low_y, high_y = front_opening(system, position)
     grid = np.array([low_x, (high_x - low_x) / nx, low_y, (high_y - low_y) / ny])
     parts = prescription(system, wavelength)
     pixels = np.zeros(sensor.pixels)
-    account = np.zeros((len(parts.shapes) + 1, 4))
+    account = np.zeros((len(parts.shapes) + 2, 4))
     with using(threads):
         kernels.illuminate(
             nx,
@@ -273,7 +302,8 @@ def _budget(
             f"{element.part}{side}"
             for element in system.elements
             for side in ("", ", back")[: len(element.surfaces())]
-        ),
+        )
+        + ("the sensor's plane",),
         missed=missed,
         blocked=blocked,
         totally_reflected=totally,
@@ -288,7 +318,9 @@ class LightTable:
     its light, and how much. Both are computed, for `COLUMNS` parts of the open pupil, on a lattice
     in X/distance, Y/distance and 1/distance, when they are first needed, and interpolated by cubic
     polynomials in between; the parts are then laid on the pixels. Caustics move and sharpen as they
-    should.
+    should. Where that is not good enough, because edges within the head or the rim of the field pass
+    through, rays are traced: a cell of the lattice is used only if, in its middle, it differs from
+    them by less than `TOLERANCE`.
 
     Parameters
     ----------
@@ -306,8 +338,10 @@ class LightTable:
     """Of the lattice: slopes, and 1/mm."""
     CLOSEST = 200.0
     """Nearer sources than this, mm, are computed anew each time."""
+    TOLERANCE = 0.01
+    """Of the peak, RMS over the pixels that get light."""
     CELLS = 512
-    """So many of its cells are kept, 0.2 MB each."""
+    """So many of its cells are kept, 0.2 MB each, and eight times as many nodes of 3 kB."""
 
     def __init__(
         self, system: OpticalSystem, sensor: LineSensor = TCD1304, *, wavelength: float = 0.63
@@ -355,14 +389,12 @@ class LightTable:
             return pixel_response(self.system, position, self.sensor, wavelength=self.wavelength)
         if not cell.size:
             return pixels
-        weights = [_cubic(value - start) for value, start in zip(at, first, strict=True)]
-        along = np.multiply.outer(np.multiply.outer(weights[0], weights[1]), weights[2]).ravel()
-        columns = (along @ cell).reshape(3, -1)
-        load_kernels().lay(columns, 1 / distance**2, self.sensor.pitch, pixels)
+        within = (at[0] - first[0], at[1] - first[1], at[2] - first[2])
+        self._lay(cell, within, 1 / distance, pixels)
         return pixels
 
     def _cell(self, first: tuple[int, int, int]) -> NDArray[np.float64] | None:
-        """The 64 nodes around a cell, shape (64, 3 COLUMNS); empty in the dark, None at its rim."""
+        """The 64 nodes around a cell, shape (64, 3 COLUMNS); empty if dark, None if to be traced."""
         if first in self._cells:
             self._cells.move_to_end(first)
             return self._cells[first]
@@ -374,8 +406,42 @@ class LightTable:
         ]
         lit = sum(bool(node.size) for node in nodes)
         cell = np.stack(nodes) if lit == len(nodes) else None if lit else np.empty(0)
+        if not self._right(first, cell):
+            cell = None
         _keep(self._cells, first, cell, self.CELLS)
         return cell
+
+    def _right(self, first: tuple[int, int, int], cell: NDArray[np.float64] | None) -> bool:
+        """Whether a cell gives, in its middle, what rays give: not where edges move through it."""
+        if cell is None:
+            return False
+        slope_x, slope_y, near = (
+            (number + 1.5 + offset) * step
+            for number, offset, step in zip(first, _OFFSETS, self.STEPS, strict=True)
+        )
+        place = (slope_x / near, slope_y / near, 1 / near)
+        traced = pixel_response(self.system, place, self.sensor, wavelength=self.wavelength)
+        found = np.zeros(self.sensor.pixels)
+        if cell.size:
+            self._lay(cell, (1.5, 1.5, 1.5), near, found)
+        lit = (traced > 0) | (found > 0)
+        if not lit.any():
+            return True
+        error = np.sqrt(np.mean((found - traced)[lit] ** 2))
+        return bool(error <= self.TOLERANCE * traced.max())
+
+    def _lay(
+        self,
+        cell: NDArray[np.float64],
+        at: tuple[float, float, float],
+        near: float,
+        pixels: NDArray[np.float64],
+    ) -> None:
+        """Interpolate a cell's columns at a place in units of its nodes, and lay them on pixels."""
+        x, y, z = (_cubic(value) for value in at)
+        weights = np.multiply.outer(np.multiply.outer(x, y), z).ravel()
+        columns = (weights @ cell).reshape(3, -1)
+        load_kernels().lay(columns, near**2, self.sensor.pitch, pixels)
 
     def _node(self, index: tuple[int, int, int]) -> NDArray[np.float64]:
         if index not in self._nodes:
@@ -385,7 +451,7 @@ class LightTable:
             )
             distance = 1 / near
             node = self._pupil((slope_x * distance, slope_y * distance, distance))
-            _keep(self._nodes, index, node, 64 * self.CELLS)
+            _keep(self._nodes, index, node, 8 * self.CELLS)
         return self._nodes[index]
 
     def _pupil(self, position: tuple[float, float, float]) -> NDArray[np.float64]:
@@ -456,7 +522,7 @@ def _cubic(t: float) -> NDArray[np.float64]:
 
 
 def _keep(store: OrderedDict[Any, Any], key: Any, value: Any, most: int) -> None:
-    """Store a value and forget the one that was used longest ago."""
+    """Store a value, and forget the first if there are too many."""
     store[key] = value
     if len(store) > most:
         store.popitem(last=False)

@@ -16,7 +16,7 @@ import numpy as np
 from acquisition.frames import CHANNELS
 from raytransfer import TCD1304, OpticalSystem, prototype_head
 from raytransfer import _checks as check
-from raytransfer.irradiance import LightTable, disc, photon_energy, pixel_response
+from raytransfer.irradiance import LightTable, disc, disc_points, photon_energy, pixel_response
 from raytransfer.studies import room_to_optical
 
 if TYPE_CHECKING:
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from raytransfer import LineSensor
 
 LUMINOUS_EFFICACY = 683.0  # lm/W at 555 nm
+CLOSEST = 20.0  # mm from the first vertex: nearer ones are not seen
 
 
 @dataclass(frozen=True)
@@ -167,11 +168,12 @@ class World:
         solid_angles = _from_table if self.moving else _traced
         for led in self.leds:
             place = self.seen_from(led, pose)
-            if place[2] <= 0:
-                continue  # behind the tracker
+            if place[2] <= CLOSEST:
+                continue  # behind the tracker, or in its lenses
             intensity = led.intensity(pose.x, pose.y, 0.0)
             rate = intensity * self._electrons_per_joule(led.wavelength)
-            for point, share in disc(place, led.extent):
+            points = disc_points(self.head, led.extent, place[2], self.sensor)
+            for point, share in disc(place, led.extent, points):
                 angles = solid_angles(self.head, self.sensor, led.wavelength, point)
                 rates[led.channel] += rate * share * angles
         return rates
