@@ -129,10 +129,14 @@ def save_design(
     ------
     ValueError
         As `Design`; or if the path has another suffix.
+    FileNotFoundError
+        If there is no such folder.
     """
     target = Path(path)
     if target.suffix != ".toml":
         raise ValueError(f"{target}: a design file ends in .toml")
+    if not target.parent.is_dir():
+        raise FileNotFoundError(f"{target}: there is no folder {target.parent}; make it first")
     text = design_text(Design(system, sensor, notes))
     handle, part = tempfile.mkstemp(dir=target.parent, prefix=f".{target.stem}-", suffix=".part")
     try:

@@ -133,6 +133,10 @@ class World:
         if len(set(channels)) != len(channels):
             raise ValueError(f"LED channels {channels}: each may be used once")
         check.not_negative("ambient", self.ambient, "illuminance on the pixels, lx")
+        if not isinstance(self.head, OpticalSystem):
+            raise TypeError(
+                f"head = {self.head!r:.60}: an OpticalSystem is needed; of a Design take .system"
+            )
         if self.sensor.response is None:
             raise ValueError(f"{self.sensor.name}: its data file lacks the spectral response")
 

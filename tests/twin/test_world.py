@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from raytransfer import TCD1304
+from raytransfer.designs import DESIGNS
 from raytransfer.irradiance import pixel_response
 from twin.world import Led, Pose, World, two_leds
 
@@ -95,3 +96,8 @@ def test_a_wrong_room_is_refused(wrong: object, message: str) -> None:
     assert callable(wrong)
     with pytest.raises(ValueError, match=message):
         wrong()
+
+
+def test_a_design_is_not_yet_a_head() -> None:
+    with pytest.raises(TypeError, match=r"of a Design take \.system"):
+        World(head=DESIGNS["thesis"])  # type: ignore[arg-type]
