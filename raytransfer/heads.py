@@ -290,6 +290,9 @@ COLUMNS = 96
 FINE = 4
 """Parts of a pixel in which light is blurred, before they are added."""
 
+DARKNESS = 1e-6
+"""Electrons of the brightest pixel: less is what rounding leaves where there is no light."""
+
 SHIFT = 0.25
 """Pixels that an image moves, one way and the other, for the difference that is a slope."""
 
@@ -482,7 +485,8 @@ def _spike_bounds(
         spike = electrons - ((weight * electrons).sum(axis=1) / total)[:, None]
         along = (weight * slope * spike).sum(axis=1) / (weight * spike**2).sum(axis=1)
         slope -= np.where(np.isfinite(along), along, 0.0)[:, None] * spike
-        return np.asarray(1 / np.sqrt((weight * slope**2).sum(axis=1)))
+        bound = 1 / np.sqrt((weight * slope**2).sum(axis=1))
+    return np.where(electrons.max(axis=1) > DARKNESS, bound, np.inf)
 
 
 class PositionBounds(NamedTuple):

@@ -290,6 +290,9 @@ def test_an_led_that_is_not_seen_leaves_nothing() -> None:
     bounds = position_bounds(THESIS, wide, 1300.0, angles=9)
     assert math.isinf(bounds.worst)
     assert np.isfinite(bounds.total[len(bounds.x) // 2])
+    # just off the line's end, where rounding leaves some 1e-10 electrons
+    aside = replace(BETTER.system(), sensor_placement=Placement((0.3, 0.0)))
+    assert worst_bounds(aside, DARK, angles=13)[1] == math.inf
 
 
 def test_a_head_off_its_place_is_computed_on_both_sides() -> None:
