@@ -93,9 +93,20 @@ def profile(x: ArrayLike, weight: ArrayLike, pitch: float = TCD1304.pitch) -> Pr
     -------
     Profile
         Of shape (...).
+
+    Raises
+    ------
+    ValueError
+        If a place or a weight is not finite, or a weight is below 0.
     """
     check.positive("pitch", pitch)
-    x, weight = np.broadcast_arrays(np.asarray(x, float), np.asarray(weight, float))
+    x, weight = check.array("x", x), check.array("weight", weight)
+    if weight.size and weight.min() < 0:
+        raise ValueError(
+            f"weight = {weight.min():g}: allowed is >= 0, it is how much light there is; "
+            "was a background subtracted?"
+        )
+    x, weight = np.broadcast_arrays(x, weight)
     shape, rays = x.shape[:-1], x.shape[-1]
     if not rays:
         return Profile(*(np.full(shape, np.nan)[()] for _ in Profile._fields))
@@ -175,7 +186,9 @@ class Spot:
         Of it, what does not arrive: at which surface (last: the sensor's plane) and why, see
         `LOSSES`.
     faded : float
-        Of it, what surfaces reflect of the rays that arrive.
+        Of it, what surfaces reflect of the rays that arrive: solid angle times (1 − transmission).
+        A lost ray counts in `lost` with all of its light, also what surfaces before the loss had
+        reflected, and has no part in this.
     """
 
     position: tuple[float, float, float]
@@ -491,6 +504,11 @@ class FieldStudy:
     missed, blocked, reflected : ndarray
         Share of the light that entered that is lost: past a surface, outside an opening, and by
         total reflection.
+    faded : ndarray
+        Share of the light that entered that surfaces reflect of the rays that arrive, see `Spot`.
+    arrived : ndarray
+        Share of the light that entered that arrives on the sensor's plane: what is neither lost
+        nor faded.
     on_sensor : ndarray
         Share of the light on the sensor's plane that is within the length of the line.
     """
@@ -506,6 +524,8 @@ class FieldStudy:
     missed: Array
     blocked: Array
     reflected: Array
+    faded: Array
+    arrived: Array
     on_sensor: Array
 
     @property
@@ -515,13 +535,13 @@ class FieldStudy:
 
     @property
     def lost(self) -> Array:
-        """Share of the light that entered and does not arrive."""
+        """Share of the light that entered with rays that do not arrive: lost on the way."""
         return self.missed + self.blocked + self.reflected
 
     @property
     def useful(self) -> Array:
         """Share of the light that entered and arrives within the length of the line."""
-        return (1 - self.lost) * self.on_sensor
+        return self.arrived * self.on_sensor
 
     def distortion(self, estimator: str = "chief", reference: str = "paraxial") -> Array:
         """How far light is from where it should be, mm; > 0 is toward positive X.
@@ -579,9 +599,8 @@ def field_study(
     )
     shape = dist.shape
     sources = _sources(meridian, dist.ravel(), off.ravel())
-    first = _first_glass(system)
     per_call = max(1, 1_000_000 // check.whole("rays", rays))
-    lights, losses, on_sensor = [], [], []
+    lights, shares, on_sensor = [], [], []
     for start in range(0, sources.shape[1], per_call):
         part = sources[:, start : start + per_call]
         position, direction, solid_angle = _fan_rays(system, meridian, part, rays)
@@ -590,16 +609,18 @@ def field_study(
         weight = solid_angle * light.transmission
         weight = weight.reshape(-1, rays)
         lights.append(profile(at, weight, sensor.pitch))
-        never = (light.surface >= 0) & (light.surface <= first)
-        never &= light.status != Status.REFLECTED
+        never = _beside(system, light)
         entered = np.where(never, 0.0, solid_angle).reshape(-1, rays)
         status = np.where(never, Status.ARRIVED, light.status).reshape(-1, rays)
         total = np.maximum(entered.sum(axis=1), 1e-300)
-        losses.append([(entered * (status == kind)).sum(axis=1) / total for kind in LOSSES])
+        faded = solid_angle * np.where(light.arrived, 1 - light.transmission, 0.0)
+        parts = [entered * (status == kind) for kind in LOSSES]
+        parts += [faded.reshape(-1, rays), weight]
+        shares.append([part.sum(axis=1) / total for part in parts])
         within = np.abs(at) <= sensor.length / 2
-        arrived = np.maximum(weight.sum(axis=1), 1e-300)
-        on_sensor.append((weight * within).sum(axis=1) / arrived)
-    missed, blocked, reflected = np.concatenate(losses, axis=1).reshape(3, *shape)
+        on_plane = np.maximum(weight.sum(axis=1), 1e-300)
+        on_sensor.append((weight * within).sum(axis=1) / on_plane)
+    missed, blocked, reflected, faded, arrived = np.concatenate(shares, axis=1).reshape(5, *shape)
     matrix = system.matrix(meridian, wavelength=wavelength)
     footprints = [
         footprint(system, meridian, *place)
@@ -622,6 +643,8 @@ def field_study(
         missed=missed,
         blocked=blocked,
         reflected=reflected,
+        faded=faded,
+        arrived=arrived,
         on_sensor=np.concatenate(on_sensor).reshape(shape),
     )
 
@@ -733,6 +756,12 @@ def _first_glass(system: OpticalSystem) -> int:
     return next((k for k, surface in enumerate(surfaces) if not surface.screen), len(surfaces))
 
 
+def _beside(system: OpticalSystem, light: Trace) -> NDArray[np.bool_]:
+    """Which rays never entered: they met no opening, or not the first glass."""
+    early = (light.surface >= 0) & (light.surface <= _first_glass(system))
+    return np.asarray(early & (light.status != Status.REFLECTED))
+
+
 def _sources(meridian: Meridian, dist: Array, off: Array) -> Array:
     """Sources in a meridian, shape (3, G)."""
     return np.stack([off, 0 * off, dist] if meridian == "x" else [0 * off, off, dist])
@@ -771,12 +800,11 @@ def _spot(
     lost = np.zeros((surfaces + 1, len(LOSSES)))
     gone = ~light.arrived
     np.add.at(lost, (light.surface[gone], light.status[gone].astype(int) - 1), solid_angle[gone])
-    # what meets no opening, or the edge of the first glass, never entered
-    beside = lost[: _first_glass(system) + 1, :2]
-    beside_sum = float(beside.sum())
-    beside[:] = 0.0
+    # what falls beside the first glass never entered
+    lost[: _first_glass(system) + 1, :2] = 0.0
     here = light.arrived
-    weight = solid_angle[here] * light.transmission[here]
+    transmission = light.transmission[here]
+    weight = solid_angle[here] * transmission
     direction = light.direction[:, here]
     return Spot(
         position=source,
@@ -784,7 +812,7 @@ def _spot(
         y=light.y[here],
         slope=direction[:2] / direction[2],
         weight=weight,
-        entered=float(solid_angle.sum()) - beside_sum,
+        entered=float(solid_angle[~_beside(system, light)].sum()),
         lost=lost,
-        faded=float(solid_angle[here].sum() - weight.sum()),
+        faded=float((solid_angle[here] * (1 - transmission)).sum()),
     )

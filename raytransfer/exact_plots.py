@@ -44,8 +44,8 @@ QUANTITIES = {
     "w50": "width that holds 50 % of the light (mm)",
     "displacement": "between peak and paraxial position (mm)",
     "lost": "light lost on the way (%)",
-    "on_sensor": "of the rest, on the sensor (%)",
-    "useful": "light that gets to the sensor (%)",
+    "on_sensor": "of what arrives, on the sensor (%)",
+    "useful": "of what enters, on the sensor (%)",
 }
 
 
@@ -190,7 +190,8 @@ def plot_profile(
     Parameters
     ----------
     spot : Spot
-        All of its light counts, also what is above or below the line.
+        All of its light counts, also what is above or below the line. Without any, the legend says
+        so.
     ax : Axes
     paraxial : Footprint, optional
         As from `illumination.footprint`. What is narrower than a pixel is drawn a pixel wide.
@@ -200,13 +201,19 @@ def plot_profile(
     """
     found = spot.profile("x", sensor.pitch)
     edges = (np.arange(sensor.pixels + 1) - sensor.pixels / 2) * sensor.pitch
-    light, _ = np.histogram(spot.x, edges, weights=100 * spot.weight / spot.weight.sum())
+    total = float(spot.weight.sum())
+    light, _ = np.histogram(spot.x, edges, weights=100 * spot.weight / (total or 1.0))
     end = sensor.length / 2
     if within is None:
         within = _extent(spot, sensor)
     floor = 1e-3
     ax.stairs(
-        np.maximum(light, floor), edges, baseline=floor, fill=True, color=RAYS[1], label="exact"
+        np.maximum(light, floor),
+        edges,
+        baseline=floor,
+        fill=True,
+        color=RAYS[1],
+        label="exact" if total else "exact: no light arrives",
     )
     if paraxial is not None:
         width = max(paraxial.width, sensor.pitch)
@@ -219,7 +226,8 @@ def plot_profile(
             linewidth=1.6,
             label="paraxial",
         )
-    ax.axvline(float(found.median), color="k", linewidth=1, linestyle=DASHES, label="median")
+    if total:
+        ax.axvline(float(found.median), color="k", linewidth=1, linestyle=DASHES, label="median")
     for side in (-end, end):
         if within[0] < side < within[1]:
             beyond = (side, within[1]) if side > 0 else (within[0], side)
@@ -238,6 +246,8 @@ def plot_profile(
 
 def _extent(spot: Spot, sensor: LineSensor) -> tuple[float, float]:
     """Part of the line, mm, that holds all but 2 % of the light, with some dark around it."""
+    if not spot.weight.any():
+        return -sensor.length / 2, sensor.length / 2
     order = np.argsort(spot.x)
     share = np.cumsum(spot.weight[order])
     ends = np.interp([0.01, 0.99], share / share[-1], spot.x[order])
@@ -412,7 +422,8 @@ def plot_losses(study: FieldStudy, ax: Axes) -> Axes:
     angle = np.degrees(study.angle)
     parts = {
         "on the sensor": study.useful,
-        "beyond its ends": (1 - study.lost) * (1 - study.on_sensor),
+        "beyond its ends": study.arrived * (1 - study.on_sensor),
+        "reflected by surfaces": study.faded,
         "outside an opening": study.blocked,
         "totally reflected": study.reflected,
         "past a surface": study.missed,
@@ -421,6 +432,7 @@ def plot_losses(study: FieldStudy, ax: Axes) -> Axes:
     colours = {
         "on the sensor": RAYS[1],
         "beyond its ends": "#9ecae1",
+        "reflected by surfaces": "0.85",
         "outside an opening": "#E69F00",
         "totally reflected": RAYS[0],
         "past a surface": "0.6",
@@ -506,6 +518,7 @@ def plot_head(
     line = np.array([-1, 1]) * sensor.length / 2
     ax.plot([end, end], line, [0, 0], color=SENSOR, linewidth=4, label="pixel line")
     ax.set(xlabel="Z (mm)", ylabel="X (mm)", zlabel="Y (mm)")
+    ax.yaxis.set_major_locator(MaxNLocator(3))  # is foreshortened: more would overlap
     ax.set_box_aspect((1.7, 1, 1), zoom=1.15)
     ax.view_init(elev=20, azim=-60)
     ax.legend(loc="upper left")

@@ -31,7 +31,7 @@ from raytransfer.outdoors import ambient_rate, pixel_view
 from raytransfer.sensors import TCD1304, LineSensor
 from raytransfer.sources import Emitter
 from raytransfer.studies import room_to_optical
-from raytransfer.systems import OpticalSystem
+from raytransfer.systems import NOMINAL, OpticalSystem
 from raytransfer.tracing import front_opening, trace
 
 if TYPE_CHECKING:
@@ -263,9 +263,13 @@ class Scene:
         return distance * math.tan(self.field) - max(map(abs, self.leds))
 
     def background(self, system: OpticalSystem, sensor: LineSensor = TCD1304) -> float:
-        """Electrons that ambient light leaves in a pixel, taken from the middle one."""
+        """Electrons that ambient light leaves in a pixel, taken from the middle one.
+
+        With everything in its place: what decides is how much a pixel sees, not quite where.
+        """
         if not self.ambient:
             return 0.0
+        system = replace(system, placements=(), sensor_placement=NOMINAL)
         view = pixel_view(system, (sensor.pixels - 1) / 2, sensor, rays=20_000)
         return ambient_rate(view, sensor=sensor) * self.ambient * self.integration_time
 

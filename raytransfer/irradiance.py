@@ -298,12 +298,14 @@ def _budget(
         on_pixels=math.fsum(pixels),
         beside_line=beside,
         beyond_ends=beyond,
-        surfaces=tuple(
-            f"{element.part}{side}"
-            for element in system.elements
-            for side in ("", ", back")[: len(element.surfaces())]
-        )
-        + ("the sensor's plane",),
+        surfaces=(
+            *(
+                f"{element.part}{side}"
+                for element in system.elements
+                for side in ("", ", back")[: len(element.surfaces())]
+            ),
+            "the sensor's plane",
+        ),
         missed=missed,
         blocked=blocked,
         totally_reflected=totally,

@@ -393,6 +393,58 @@ def saturation_ambient(
     return max(room, 0.0) / (rate * integration_time)
 
 
+@dataclass(frozen=True)
+class _Difference(Noise):
+    """Noise of a frame less an unlit one of the same scene."""
+
+    unlit: float = 0.0
+
+    def variance(self, electrons: ArrayLike) -> NDArray[np.float64]:
+        return super().variance(electrons) + super().variance(self.unlit)
+
+    def unsaturated(self, electrons: ArrayLike) -> NDArray[np.bool_]:
+        # frames are cut off before they are subtracted, and the lit one sooner
+        frame = Noise(self.full_well, self.read_noise, self.electrons_per_code, self.codes)
+        return frame.unsaturated(electrons)
+
+
+def ambient_bound(
+    electrons: ArrayLike,
+    background: float,
+    *,
+    noise: Noise | None = None,
+    subtracted: bool = False,
+    nuisance: tuple[Nuisance, ...] = ("amplitude", "background"),
+) -> float:
+    """Return the `spike_bound` of a spike on an even scene, 1 σ in px.
+
+    Parameters
+    ----------
+    electrons : array_like, shape (N,)
+        Expected charge per pixel of the LED alone.
+    background : float
+        Expected charge that the scene leaves in each pixel.
+    noise : Noise, optional
+        Of one frame.
+    subtracted : bool
+        An unlit frame is subtracted, which adds the noise of its scene, read-out and quantisation.
+        Which pixels are full is decided before, in each frame.
+    nuisance : tuple of str
+        As for `spike_bound`. A scene that was subtracted need not be estimated.
+
+    Returns
+    -------
+    float
+        px; infinite where the position cannot be told.
+    """
+    noise = noise or Noise()
+    if subtracted:
+        noise = _Difference(
+            noise.full_well, noise.read_noise, noise.electrons_per_code, noise.codes, background
+        )
+    return spike_bound(electrons, noise, background=background, nuisance=nuisance)
+
+
 def largest_ambient(
     electrons: ArrayLike,
     wanted: float,
@@ -405,7 +457,7 @@ def largest_ambient(
 ) -> float:
     """Return the illuminance in lux up to which a spike can be located as well as wanted.
 
-    There the `spike_bound` is `wanted`: the scene's light scatters, and pixels that it helps to
+    There the `ambient_bound` is `wanted`: the scene's light scatters, and pixels that it helps to
     fill are lost.
 
     Parameters
@@ -416,11 +468,8 @@ def largest_ambient(
         Largest allowed standard deviation, px.
     rate, integration_time : float
         As for `saturation_ambient`; the rate is taken as that of all the pixels.
-    noise : Noise, optional
-    subtracted : bool
-        An unlit frame is subtracted, which adds the noise of its scene and read-out.
-    nuisance : tuple of str
-        As for `spike_bound`. A scene that was subtracted need not be estimated.
+    noise, subtracted, nuisance
+        As for `ambient_bound`.
 
     Returns
     -------
@@ -432,10 +481,9 @@ def largest_ambient(
     noise = noise or Noise()
 
     def bound(background: float) -> float:
-        # of the second frame: scene, read-out and quantisation once more
-        second = float(noise.variance(background)) if subtracted else 0.0
-        both = replace(noise, read_noise=math.sqrt(noise.read_noise**2 + second))
-        return spike_bound(electrons, both, background=background, nuisance=nuisance)
+        return ambient_bound(
+            electrons, background, noise=noise, subtracted=subtracted, nuisance=nuisance
+        )
 
     low, high = 0.0, noise.saturation
     if bound(low) > wanted:

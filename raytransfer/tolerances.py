@@ -549,8 +549,11 @@ def monte_carlo(
     seed : int
     executor : concurrent.futures.Executor, optional
         What runs the samples, in `PIECES` pieces at most; in this thread when left out. Processes
-        must be spawned: ``ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn"))``.
-        Dask's ``Client.get_executor()`` is one, too. It is not shut down.
+        are the usual choice, and must be spawned:
+        ``ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn"))``. Dask's
+        ``Client.get_executor()`` is one, too. A ThreadPoolExecutor needs numba's threading layer
+        omp or tbb (``numba.config.THREADING_LAYER``) where the metric traces rays: the layer
+        workqueue is not thread-safe. The executor is not shut down.
 
     Raises
     ------

@@ -33,7 +33,7 @@ from raytransfer.analysis import (
 )
 from raytransfer.illumination import footprint
 from raytransfer.lenses import Aperture, Lens, Plate, SphericalLens
-from raytransfer.materials import MATERIALS
+from raytransfer.materials import MATERIALS, ConstantIndex
 from raytransfer.prescription import surface_frames
 from raytransfer.studies import plate_effect
 from raytransfer.systems import OpticalSystem, Placement
@@ -142,6 +142,17 @@ def test_profiles_of_many_rows_are_those_of_each() -> None:
     assert np.isnan(profile(np.empty((2, 0)), np.empty((2, 0))).median).all()
 
 
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("name", ["x", "weight"])
+def test_a_profile_refuses_what_is_no_light(name: str, bad: float) -> None:
+    values = {"x": [0.0, 1.0], "weight": [1.0, 1.0]}
+    values[name] = [1.0, bad]
+    with pytest.raises(ValueError, match=f"{name} = {bad}: allowed are finite numbers"):
+        profile(values["x"], values["weight"])
+    with pytest.raises(ValueError, match=r"weight = -0\.5: allowed is >= 0.*background"):
+        profile([0.0, 1.0], [1.0, -0.5])
+
+
 # --- spots ---
 
 
@@ -158,6 +169,35 @@ def test_no_light_is_unaccounted_for(
     kinds = [light.lost_share(kind) for kind in (Status.MISSED, Status.BLOCKED, Status.REFLECTED)]
     assert_allclose(sum(kinds), light.lost_share(), atol=1e-15)
     assert 0 < light.arrived < 1
+
+
+def test_each_part_of_the_light_is_summed_by_itself() -> None:
+    """Where it is tiny beside the others, so that a difference of sums would not have it."""
+    plate = Plate("nearly air", 5.0, ConstantIndex("nearly air", 1.0001))
+    faint = OpticalSystem("plate", (Aperture("stop", 20.0, 20.0), plate), (1.0,), 9.0)
+    rays = bundle(faint, (0.0, 0.0, 5000.0), 101, 101)
+    light = trace(faint, rays.position, rays.direction)
+    found = spot(faint, (0.0, 0.0, 5000.0), 101, 101)
+    assert_allclose(found.faded, math.fsum(rays.solid_angle * (1 - light.transmission)), rtol=1e-12)
+    assert_allclose(found.faded / found.entered, 2 * (0.0001 / 2.0001) ** 2, rtol=1e-3)
+    assert spot(faint, (0.0, 0.0, 5000.0), 101, 101, fresnel=False).faded == 0
+
+    # a square window over the rim of a round lens, which all but a few rays pass by
+    elements = (Aperture("window", 3.0, 3.0), SphericalLens("round", 20.0, 40.0, 1e9, 4.0, GLASS))
+    placements = (Placement((8.56, 8.56)), Placement())
+    corner = OpticalSystem("corner", elements, (0.0,), 70.0, placements)
+    rays = bundle(corner, (0.0, 0.0, 5000.0), 301, 301)
+    light = trace(corner, rays.position, rays.direction)
+    enter = light.arrived | (light.surface > 1)
+    assert 0 < enter.sum() < 30
+    found = spot(corner, (0.0, 0.0, 5000.0), 301, 301)
+    assert_allclose(found.entered, math.fsum(rays.solid_angle[enter]), rtol=1e-14)
+
+
+def test_lost_rays_do_not_fade() -> None:
+    light = fan(SHUT, "x", 5000, 2000, rays=101)
+    assert light.faded == 0
+    assert_allclose(light.lost.sum(), light.entered, rtol=1e-12)
 
 
 @pytest.mark.parametrize(("system", "kind"), [(HEAD, Status.BLOCKED), (PAIR, Status.REFLECTED)])
@@ -359,6 +399,9 @@ def test_a_study_is_the_fans_of_its_places() -> None:
         assert_allclose(study.lost[i, j], light.lost_share(), atol=1e-14)
         assert_allclose(study.blocked[i, j], light.lost_share(Status.BLOCKED), atol=1e-14)
         assert_allclose(study.on_sensor[i, j], light.on(), rtol=1e-12)
+        assert_allclose(study.arrived[i, j], light.arrived, rtol=1e-12)
+        assert_allclose(study.faded[i, j], light.faded / light.entered, rtol=1e-12)
+        assert_allclose(study.useful[i, j], light.arrived * light.on(), rtol=1e-12)
         assert_allclose(study.chief[i, j], chief_rays(PAIR, (offset, 0, distance))[0], atol=1e-9)
         light_box = footprint(PAIR, "x", distance, float(offset))
         assert light_box is not None
@@ -367,8 +410,23 @@ def test_a_study_is_the_fans_of_its_places() -> None:
             study.image_point[i, j], cast_rays(30, matrix, distance, offset).focal_offset
         )
     assert_allclose(study.angle, np.arctan(offsets / distances))
-    assert_allclose(study.useful, (1 - study.lost) * study.on_sensor)
+    assert_allclose(study.lost + study.faded + study.arrived, 1)
     assert_allclose(study.distortion("median", "f_tan"), study.light.median - study.f_tan)
+
+
+def test_useful_is_what_is_really_on_the_sensor() -> None:
+    """Counted from the trace itself, with what surfaces reflect."""
+    aim = ((np.arange(4001) + 0.5) / 4001 - 0.5) * 30
+    start = np.array([[2420.0], [0.0], [-5000.0]]).repeat(4001, axis=1)
+    direction = np.stack([aim, 0 * aim, 0 * aim]) - start
+    light = trace(PAIR, start, direction)
+    solid_angle = 5000 / (direction**2).sum(axis=0) ** 1.5
+    on = light.arrived & (np.abs(light.x) <= TCD1304.length / 2)
+    study = field_study(PAIR, 5000, 2420, rays=4001)
+    expected = (solid_angle * light.transmission)[on].sum() / solid_angle.sum()
+    assert_allclose(study.useful, expected, rtol=1e-9)
+    assert_allclose(study.useful, 0.415, atol=5e-4)
+    assert_allclose(study.faded, 0.165, atol=5e-4)
 
 
 def test_near_the_axis_everything_is_paraxial() -> None:
@@ -412,7 +470,7 @@ def test_light_that_never_arrives() -> None:
     study = field_study(SHUT, 5000, 2000, rays=101)
     assert np.isnan(study.light.w80)
     assert np.isnan(study.paraxial_width)
-    assert study.useful == 0
+    assert study.useful == study.arrived == study.faded == 0
 
 
 def test_light_that_never_enters() -> None:
@@ -420,7 +478,8 @@ def test_light_that_never_enters() -> None:
     system = OpticalSystem("deep", (Aperture("slit", x=1.0), FIRST), (20.0,), 50.0)
     light = fan(system, "x", 50, 400, rays=101)
     assert light.entered == light.arrived == light.lost_share() == 0
-    assert field_study(system, 50, 400, rays=101).lost == 0
+    study = field_study(system, 50, 400, rays=101)
+    assert study.lost == study.arrived == study.faded == study.useful == 0
 
 
 # --- found independently: the f 60 pair alone, ±15 mm, sensor in the paraxial focus of 5 m ---

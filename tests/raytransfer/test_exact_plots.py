@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
@@ -16,13 +16,13 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, StepPatch
 from numpy.testing import assert_allclose
 
-from raytransfer import TCD1304, cast_rays, exact_plots, prototype_head, telecentric_pair
+from raytransfer import TCD1304, cast_rays, exact_plots, plots, prototype_head, telecentric_pair
 from raytransfer.analysis import fan, field_study, spot, through_focus
 from raytransfer.illumination import footprint
 from raytransfer.lenses import Aperture
 from raytransfer.plots import RAYS
 from raytransfer.systems import OpticalSystem, Placement
-from raytransfer.tracing import trace
+from raytransfer.tracing import Status, trace
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -164,6 +164,19 @@ def test_profile_shows_the_end_of_the_line(ax: Axes) -> None:
     assert ax.get_xlim() == (-1, 2)
 
 
+def test_no_light_is_shown_as_none(ax: Axes) -> None:
+    shut = OpticalSystem("shut", (*BARE.elements, Aperture("slit", x=0.1)), (0.0, 20.0), 1.0)
+    light = fan(shut, "x", 5000, 2000, rays=101)
+    exact_plots.plot_profile(light, ax, paraxial=footprint(PAIR, "x", 5000, 2000))
+    drawn(ax)
+    values, _, _ = next(p for p in ax.patches if isinstance(p, StepPatch)).get_data()
+    assert_allclose(values, 1e-3)  # the floor of the axis
+    assert texts(ax) == ["exact: no light arrives", "paraxial"]
+    assert_allclose(ax.get_xlim(), (-HALF, HALF))
+    exact_plots.plot_profile(light, ax, within=(-1, 2))
+    assert ax.get_xlim() == (-1, 2)
+
+
 def test_spot_shows_all_light_on_the_plane(ax: Axes) -> None:
     light = spot(HEAD, (300, 200, 3000), 301, 301)
     exact_plots.plot_spot(light, ax, pixel=0.2)
@@ -265,10 +278,20 @@ def test_losses_add_up(ax: Axes) -> None:
     assert texts(ax) == [
         "on the sensor",
         "beyond its ends",
+        "reflected by surfaces",
         "outside an opening",
         "totally reflected",
     ]
-    assert len(areas) == 4
+    assert len(areas) == 5
+    light = fan(PAIR, "x", 5000, 2420, rays=4001)
+    useful = 100 * light.arrived * light.on()
+    thick = [useful, 100 * light.arrived - useful, 100 * light.faded / light.entered]
+    thick += [100 * light.lost_share(kind) for kind in (Status.BLOCKED, Status.REFLECTED)]
+    edge = np.degrees(np.arctan2(2420, 5000))
+    for area, expected in zip(areas, thick, strict=True):
+        points = np.asarray(area.get_paths()[0].vertices)
+        there = points[np.isclose(points[:, 0], edge), 1]
+        assert_allclose(np.ptp(there), expected, atol=1e-9)
     top = np.asarray(areas[-1].get_paths()[0].vertices)[:, 1].max()
     assert_allclose(top, 100, atol=0.05)
 
@@ -292,6 +315,27 @@ def test_head_in_space() -> None:
         "source at 0.2, 0.3, 2 m",
         "pixel line",
     ]
+
+
+@pytest.mark.parametrize("sources", [[(0, 0, 5000), (1500, 800, 5000)], [(200, 300, 2000)]])
+def test_labels_of_the_head_in_space_do_not_overlap(
+    sources: list[tuple[float, float, float]],
+) -> None:
+    with mpl.rc_context():
+        plots.style()
+        figure = Figure(figsize=(7, 4.6))
+        FigureCanvasAgg(figure)
+        ax = figure.add_subplot(projection="3d")
+        exact_plots.plot_head(HEAD, sources, ax)
+        figure.canvas.draw()
+    boxes = []
+    for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
+        low, high = sorted(axis.get_view_interval())
+        ticks = [t for t in axis.get_major_ticks() if low <= t.get_loc() <= high]
+        assert len(ticks) >= 3
+        boxes += [t.label1.get_window_extent() for t in ticks]
+    for first, second in combinations(boxes, 2):
+        assert not first.overlaps(second)
 
 
 def test_what_is_not_a_system_in_focus_is_drawn_too(ax: Axes) -> None:

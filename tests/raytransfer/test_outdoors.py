@@ -21,6 +21,7 @@ from raytransfer.outdoors import (
     SUNLIGHT,
     BandPass,
     PixelView,
+    ambient_bound,
     ambient_rate,
     electrons_per_joule,
     illuminance,
@@ -267,6 +268,28 @@ def test_the_largest_ambient_is_where_the_bound_is_reached(subtracted: bool) -> 
     assert largest_ambient(SPIKE, 0.03, rate, 2 * time, subtracted=subtracted) == pytest.approx(
         lux / 2
     )
+
+
+@pytest.mark.parametrize("subtracted", [False, True])
+def test_pixels_are_full_in_one_frame_not_in_the_difference(subtracted: bool) -> None:
+    flat = np.where(np.abs(np.arange(60) - 29.5) < 10, 20_000.0, 0.0)
+    # the margin of three deviations is one frame's: B + 20,000 + 3 √variance = full well
+    noise = Noise()
+    last = 14_413.6
+    assert last + 20_000 + 3 * math.sqrt(noise.variance(last + 20_000)) == pytest.approx(
+        noise.saturation, abs=1
+    )
+
+    def bound(background: float) -> float:
+        return ambient_bound(flat, background, subtracted=subtracted)
+
+    extra = float(noise.variance(last - 2)) if subtracted else 0.0
+    endless = replace(noise, full_well=1e6, read_noise=math.sqrt(noise.read_noise**2 + extra))
+    assert bound(last - 2) == pytest.approx(spike_bound(flat, endless, background=last - 2))
+    assert bound(last + 2) > 1.2 * bound(last - 2)
+    wanted = 1.1 * bound(last - 2)
+    lux = largest_ambient(flat, wanted, 1e5, 25e-6, subtracted=subtracted)
+    assert lux * 1e5 * 25e-6 == pytest.approx(last, abs=1e-4 * noise.saturation)
 
 
 def test_subtraction_lowers_the_largest_ambient() -> None:
