@@ -69,7 +69,11 @@ def arriving_rays(
         found.append((position[:, near], direction[:, near]))
         missing -= len(near)
     positions, directions = zip(*found, strict=True)
-    return np.concatenate(positions, axis=1), np.concatenate(directions, axis=1)
+    # coordinate after coordinate, as all tracers want them
+    position_of, direction_of = (
+        np.ascontiguousarray(np.concatenate(parts, axis=1)) for parts in (positions, directions)
+    )
+    return position_of, direction_of
 
 
 def _over(
