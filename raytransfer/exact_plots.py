@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.lines import Line2D
-from matplotlib.patches import Polygon
 from matplotlib.ticker import MaxNLocator
 
 from raytransfer import _checks as check
 from raytransfer.analysis import WIDTHS, FieldStudy, Spot, Width, through_focus
 from raytransfer.lenses import Aperture, Meridian, check_meridian
-from raytransfer.plots import GLASS, RAYS, SENSOR
+from raytransfer.plots import GLASS, RAYS, SENSOR, glass
 from raytransfer.reference import path
 from raytransfer.sensors import TCD1304, LineSensor
 from raytransfer.systems import MERIDIANS
@@ -165,16 +164,7 @@ def _draw_element(
         sides.append(rotation @ local + origin[:, None])
     outline = np.concatenate([sides[0], sides[1][:, ::-1]], axis=1)
     bends = any(MERIDIANS[axis] in surface.bends for surface in element.surfaces())
-    ax.add_patch(
-        Polygon(
-            np.stack([outline[2], outline[axis]], axis=1),
-            facecolor=GLASS,
-            edgecolor="0.35",
-            alpha=0.7 if bends else 0.35,
-            linewidth=0.8,
-            zorder=3,
-        )
-    )
+    ax.add_patch(glass(np.stack([outline[2], outline[axis]], axis=1), bends=bends))
 
 
 def plot_profile(

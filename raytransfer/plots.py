@@ -246,16 +246,19 @@ def _draw_glass(ax: Axes, system: OpticalSystem, meridian: Meridian, window: flo
                 ax.plot([placed.front] * 2, [side * half, end], color="k", linewidth=2)
             continue
         bends = any(meridian in side.bends for side in placed.element.surfaces())
-        ax.add_patch(
-            Polygon(
-                outline(placed, meridian, window),
-                facecolor=GLASS,
-                edgecolor="0.35",
-                alpha=0.7 if bends else 0.35,
-                linewidth=0.8,
-                zorder=3,
-            )
-        )
+        ax.add_patch(glass(outline(placed, meridian, window), bends=bends))
+
+
+def glass(corners: NDArray[np.float64], *, bends: bool) -> Polygon:
+    """Return a cross-section (N, 2) as glass; paler where it bends nothing in this meridian."""
+    return Polygon(
+        corners,
+        facecolor=GLASS,
+        edgecolor="0.35",
+        alpha=0.7 if bends else 0.35,
+        linewidth=0.8,
+        zorder=3,
+    )
 
 
 def plot_system(
