@@ -1,0 +1,1017 @@
+"""Calibration: from pixels at known places to a camera and a map of LEDs that hold over the area.
+
+Two ways. `FourCorners` is the thesis's: two LEDs, measured at the corners of the area, and in
+between an interpolation. `bundle` adjusts everything at once, camera, LEDs and the poses from which
+they were seen, so that all spikes fit best; it says how sure each number is, and refuses where the
+observations cannot tell.
+
+A file is JSON: what it holds, units included, is said in `UNITS` and `save_calibration`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Self, get_args
+
+import numpy as np
+
+from acquisition.dat import replacing
+from raytransfer import _checks as check
+from raytransfer.designs import Design
+from tracking.camera import Camera
+from tracking.leds import LedMap
+from tracking.poses import UNKNOWN, Prior, closed_form, optical, pose_jacobian
+from tracking.spikes import Correction
+
+if TYPE_CHECKING:
+    import os
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import ArrayLike, NDArray
+
+    from raytransfer import OpticalSystem
+
+Loss = Literal["linear", "huber", "soft_l1", "cauchy"]
+"""How much a residual of many σ counts, as `scipy.optimize.least_squares` names it."""
+
+LOSS_SCALE = 3.0
+"""Residuals beyond so many σ count less than their square."""
+
+OUTLIER = 5.0
+"""Residuals beyond so many σ are named in the notes."""
+
+TELLING = 5.0
+"""px RMS: a parameter whose σ would move the spikes by more is not determined."""
+
+RANK = 1e-7
+"""Singular values of the scaled Jacobian below this part of the largest are rounding."""
+
+FORMAT: Final = "linetrack calibration"
+"""What a calibration file says it is."""
+
+VERSION: Final = 1
+"""Of the format, the only one so far."""
+
+UNITS: Final = {"length": "mm", "angle": "rad", "place on the line": "px", "charge": "electrons"}
+"""Of all numbers in a file; `scale` of the camera is in px per unit of tangent."""
+
+
+class Corner(NamedTuple):
+    """What two LEDs show at a known place.
+
+    Attributes
+    ----------
+    x, y : float
+        Of the tracker, mm.
+    midpoint, separation : float
+        Of the two spikes, px.
+    """
+
+    x: float
+    y: float
+    midpoint: float
+    separation: float
+
+
+class FourCorners:
+    """The thesis's mapping: midpoint and separation of two spikes, known at four places.
+
+    Both coordinates are bilinear functions of two numbers a and b, ``c₀ + c₁ a + c₂ b + c₃ a b``,
+    that are right at the four corners. The thesis says only that "tracking within the borders of
+    the premeasured tracking space maps the tracking data to absolute positions"; `bilinear` takes
+    the midpoint and the separation as they are. They are not linear in x and y: a pinhole shows
+    midpoint = centre + f x / y and separation = f B / y. `rational` takes midpoint / separation
+    and 1 / separation, of which x and y are linear functions, so that only the lens's distortion,
+    a heading and the pupil are left.
+
+    Parameters
+    ----------
+    left_front, left_back, right_front, right_back : Corner
+
+    Raises
+    ------
+    ValueError
+        If a separation is 0 or has another sign than the rest, or the corners do not span an area.
+    """
+
+    def __init__(
+        self, left_front: Corner, left_back: Corner, right_front: Corner, right_back: Corner
+    ) -> None:
+        names = "left front", "left back", "right front", "right back"
+        self.corners = (left_front, left_back, right_front, right_back)
+        table = np.array(
+            [
+                [check.number(f"{key} of the corner {name}", v) for key, v in c._asdict().items()]
+                for name, corner in zip(names, self.corners, strict=True)
+                for c in (Corner(*corner),)
+            ]
+        )
+        x, y, midpoint, separation = table.T
+        signs = np.sign(separation)
+        if not signs.all() or (signs != signs[0]).any():
+            shown = ", ".join(f"{name} {s:g}" for name, s in zip(names, separation, strict=True))
+            raise ValueError(
+                f"separations in px: {shown}: allowed are four of one sign, not 0; was the same "
+                "LED's frame taken twice, or were the LEDs swapped at one corner?"
+            )
+        self._sign = float(signs[0])
+        places = np.column_stack([x, y])
+        self._bilinear = self._solved("midpoint and separation", midpoint, separation, places)
+        self._rational = self._solved(
+            "midpoint / separation and 1 / separation",
+            midpoint / separation,
+            1 / separation,
+            places,
+        )
+
+    def bilinear(
+        self, midpoint: ArrayLike, separation: ArrayLike
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Place of the tracker, x and y in mm, bilinear in midpoint and separation, px."""
+        return self._place(self._bilinear, *self._measured(midpoint, separation))
+
+    def rational(
+        self, midpoint: ArrayLike, separation: ArrayLike
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Place of the tracker, x and y in mm, bilinear in midpoint / separation and 1 / separation.
+
+        Raises
+        ------
+        ValueError
+            If a separation is 0 or of another sign than at the corners.
+        """
+        a, b = self._measured(midpoint, separation)
+        if a.size and (wrong := b * self._sign).min() <= 0:
+            raise ValueError(
+                f"separation = {b.flat[wrong.argmin()]:g} px: allowed is of the sign that it has at "
+                "the corners, not 0; were the two spikes swapped, or are they the same LED's?"
+            )
+        return self._place(self._rational, a / b, 1 / b)
+
+    @staticmethod
+    def _measured(
+        midpoint: ArrayLike, separation: ArrayLike
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return check.array("midpoint", midpoint, "px"), check.array("separation", separation, "px")
+
+    @staticmethod
+    def _place(
+        solved: tuple[NDArray[np.float64], ...], a: NDArray[np.float64], b: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        shift, size, c = solved
+        a, b = (a - shift[0]) / size[0], (b - shift[1]) / size[1]
+        x, y = (k[0] + k[1] * a + k[2] * b + k[3] * a * b for k in c.T)
+        return x, y
+
+    @staticmethod
+    def _solved(
+        what: str, a: NDArray[np.float64], b: NDArray[np.float64], places: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Shift and size of a and b, and the four coefficients of x and of y."""
+        pair = np.stack([a, b])
+        shift = pair.mean(axis=1)
+        size: NDArray[np.float64] = np.ptp(pair, axis=1)
+        if (size > 0).all():
+            a, b = (pair - shift[:, None]) / size[:, None]
+            system = np.column_stack([np.ones(4), a, b, a * b])
+            if np.linalg.cond(system) < 1e6:
+                return shift, size, np.asarray(np.linalg.solve(system, places))
+        raise ValueError(
+            f"{what} at the four corners do not span an area: {pair.T.round(6).tolist()}; are two "
+            "corners the same measurement, or do all lie on one line?"
+        )
+
+
+@dataclass(frozen=True)
+class Observation:
+    """Spikes seen from one pose.
+
+    Parameters
+    ----------
+    channels : sequence of int
+        LEDs.
+    pixels : array_like, shape (N,)
+        Their spikes, px.
+    sigma : array_like
+        Standard deviation of each, px: shape (N,), or one for all.
+    x, y : Prior
+        What is known of the tracker's place, mm. An infinite σ is "nothing"; the value is then
+        ignored.
+    heading : Prior
+        The same of its heading, rad.
+    height : float
+        Of the tracker, mm; taken as known.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit, an LED is seen twice, or a number is out of its range.
+    """
+
+    channels: Sequence[int]
+    pixels: ArrayLike
+    sigma: ArrayLike
+    x: Prior = UNKNOWN
+    y: Prior = UNKNOWN
+    heading: Prior = UNKNOWN
+    height: float = 0.0
+
+    def __post_init__(self) -> None:
+        channels = tuple(int(channel) for channel in self.channels)
+        pixels = check.array("pixels", self.pixels, "leave out LEDs that were not found")
+        sigma = np.broadcast_to(check.positive_array("sigma", self.sigma), pixels.shape)
+        if pixels.shape != (len(channels),):
+            raise ValueError(
+                f"pixels has shape {pixels.shape}: one spike for each of {len(channels)} channels "
+                "is needed"
+            )
+        if len(set(channels)) != len(channels):
+            raise ValueError(f"LED channels {list(channels)}: each is seen once from a pose")
+        for name in ("x", "y", "heading"):
+            value, spread = getattr(self, name)
+            check.number(name, value)
+            if not spread >= 0:
+                raise ValueError(
+                    f"σ of {name} = {spread}: allowed is 0 (known) to infinity (unknown)"
+                )
+        check.number("height", self.height, "mm")
+        for name, value in (("channels", channels), ("pixels", pixels), ("sigma", sigma)):
+            object.__setattr__(self, name, value)
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """All that a tracker must know of its head, its sensor and its LEDs.
+
+    Parameters
+    ----------
+    camera : Camera
+    leds : LedMap
+    correction : Correction, optional
+        Of the sensor's pixels.
+    names : tuple of str
+        Of the parameters that were estimated: those of `Camera.names`, and ``"LED 3 x"``.
+    covariance : ndarray, shape (P, P), optional
+        Of these, in the squares and products of their units; None where nothing was measured.
+    rms : float
+        Of the residuals, px; NaN where nothing was measured.
+    spikes : int
+        Spikes that it is based on.
+    redundancy : int
+        Spikes and priors more than parameters.
+    notes : str
+        For people.
+    """
+
+    camera: Camera
+    leds: LedMap
+    correction: Correction | None = None
+    names: tuple[str, ...] = ()
+    covariance: NDArray[np.float64] | None = None
+    rms: float = math.nan
+    spikes: int = 0
+    redundancy: int = 0
+    notes: str = ""
+
+    def __post_init__(self) -> None:
+        shape = () if self.covariance is None else np.shape(self.covariance)
+        if shape != ((len(self.names),) * 2 if self.covariance is not None else ()):
+            raise ValueError(
+                f"covariance has shape {shape}: a row and a column for each of {len(self.names)} "
+                "names are needed"
+            )
+        if self.covariance is None and self.names:
+            raise ValueError("names of estimated parameters come with their covariance")
+        if unknown := set(self.names) - set(_names(self.camera, self.leds)):
+            raise ValueError(f"names: neither camera nor LEDs have {', '.join(sorted(unknown))}")
+
+    @classmethod
+    def nominal(
+        cls,
+        head: Design | OpticalSystem,
+        leds: LedMap,
+        *,
+        correction: Correction | None = None,
+        **options: Any,
+    ) -> Self:
+        """Calibration without data: the camera that the drawing says, and LEDs where they should be.
+
+        Parameters
+        ----------
+        head : Design or OpticalSystem
+        leds : LedMap
+        correction : Correction, optional
+        **options
+            As for `Camera.from_system`.
+        """
+        if isinstance(head, Design):
+            options = {"sensor": head.sensor, **options}
+            head = head.system
+        camera = Camera.from_system(head, **options)
+        notes = (
+            f"Nominal: {head.name}, traced as drawn; no head is as drawn, and nothing was measured."
+        )
+        return cls(camera, leds, correction, notes=notes)
+
+    def sigma(self, name: str) -> float:
+        """Standard deviation of a parameter; 0 of one that was held, NaN where nothing was measured.
+
+        Raises
+        ------
+        KeyError
+            If there is no such parameter.
+        """
+        known = _names(self.camera, self.leds)
+        if name not in known:
+            raise KeyError(f"{name!r}: known are {', '.join(known)}")
+        if self.covariance is None:
+            return math.nan
+        if name not in self.names:
+            return 0.0
+        at = self.names.index(name)
+        return math.sqrt(self.covariance[at, at])
+
+    def pose_covariance(
+        self,
+        channels: Sequence[int],
+        x: float,
+        y: float,
+        heading: float = 0.0,
+        *,
+        height: float = 0.0,
+        sigma: float = 0.05,
+        sigma_heading: float = math.inf,
+    ) -> NDArray[np.float64]:
+        """Covariance of a pose that comes from the calibration's own uncertainty alone.
+
+        It does not average out while the tracker rests: what a tracker calls accuracy, beside the
+        jitter that its spikes have.
+
+        Parameters
+        ----------
+        channels : sequence of int
+            LEDs that the pose is found from.
+        x, y, heading, height : float
+            Tracker, mm and rad.
+        sigma : float
+            Of the spikes, px: only its ratio to `sigma_heading` matters.
+        sigma_heading : float
+            What is known of the heading, rad: 0 if it is known, infinite if not.
+
+        Returns
+        -------
+        ndarray, shape (3, 3)
+            Of x, y and heading.
+
+        Raises
+        ------
+        ValueError
+            If nothing was measured, or the LEDs do not tell a pose.
+        """
+        if self.covariance is None:
+            raise ValueError(
+                "this calibration has no covariance: it is nominal, nothing was measured"
+            )
+        rows = [self.leds.index(channel) for channel in channels]
+        pose = np.array([[x, y, heading, height]])
+        jacobian = _Rows(np.zeros(len(rows), dtype=int), np.array(rows)).jacobian(
+            self.camera, self.leds.positions, pose
+        )
+        by_name = dict(zip(_names(self.camera, self.leds), jacobian.T, strict=False))
+        along = jacobian[:, -3:]
+        prior = np.zeros((3, 3))
+        if sigma_heading == 0:
+            along = along[:, :2]
+            prior = prior[:2, :2]
+        else:
+            prior[2, 2] = (sigma / sigma_heading) ** 2
+        normal = along.T @ along + prior
+        if np.linalg.cond(normal / np.sqrt(np.outer(np.diag(normal), np.diag(normal)))) > 1e12:
+            raise ValueError(f"LEDs {list(channels)} do not tell the pose from there")
+        change = np.linalg.solve(
+            normal, along.T @ np.stack([by_name[n] for n in self.names], axis=1)
+        )
+        covariance = np.zeros((3, 3))
+        size = len(normal)
+        covariance[:size, :size] = change @ self.covariance @ change.T
+        return covariance
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the calibration as a file, which `load_calibration` reads back bit for bit.
+
+        A file of that name is replaced once the new one is complete, or not at all. The same
+        calibration gives the same bytes.
+
+        Raises
+        ------
+        ValueError
+            If the name does not end in ``.json``.
+        OSError
+            If it cannot be written.
+        """
+        if not str(path).endswith(".json"):
+            raise ValueError(f"{path}: a calibration file ends in .json")
+        data = {
+            "format": FORMAT,
+            "version": VERSION,
+            "units": UNITS,
+            "notes": self.notes,
+            "camera": self.camera.to_dict(),
+            "leds": [
+                {"channel": channel, "position": position, "facing": facing}
+                for channel, position, facing in zip(
+                    self.leds.channels,
+                    self.leds.positions.tolist(),
+                    self.leds.facings.tolist(),
+                    strict=True,
+                )
+            ],
+            "correction": None if self.correction is None else self.correction.to_dict(),
+            "parameters": list(self.names),
+            "covariance": None if self.covariance is None else self.covariance.tolist(),
+            "rms": None if math.isnan(self.rms) else self.rms,
+            "spikes": self.spikes,
+            "redundancy": self.redundancy,
+        }
+        text = json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False)
+        with replacing(str(path)) as file:
+            file.write(f"{text}\n".encode())
+
+
+def load_calibration(path: str | os.PathLike[str]) -> Calibration:
+    """Read a calibration file.
+
+    Raises
+    ------
+    ValueError
+        If it is no calibration file, of an unknown version, lacks a field or has one too many, or
+        its numbers make no calibration. The message begins with the path.
+    OSError
+        If it cannot be read.
+    """
+    with open(path, "rb") as file:  # noqa: PTH123  # whatever names a file
+        content = file.read()
+    try:
+        return _calibration(json.loads(content.decode("utf-8")))
+    except (ValueError, TypeError, KeyError) as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+_FIELDS = {
+    *("format", "version", "units", "notes", "camera", "leds", "correction"),
+    *("parameters", "covariance", "rms", "spikes", "redundancy"),
+}
+
+
+def _calibration(data: Any) -> Calibration:
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        raise ValueError(f"this is no calibration file: it does not say format = {FORMAT!r}")
+    version = data.get("version")
+    if version != VERSION or isinstance(version, bool):
+        raise ValueError(
+            f"version = {version!r}: this program reads version {VERSION}; "
+            "was the file written by a later one?"
+        )
+    _refuse_other("", data, _FIELDS)
+    if data["units"] != UNITS:
+        raise ValueError(f"units = {data['units']}: this program reads {UNITS}")
+    for name, kinds in (("camera", (dict,)), ("leds", (list,)), ("notes", (str,))):
+        if not isinstance(data[name], kinds):
+            raise TypeError(f"{name} = {data[name]!r:.60}: a {kinds[0].__name__} is needed")
+    for number, led in enumerate(data["leds"], start=1):
+        _refuse_other(f"LED number {number}: ", led, {"channel", "position", "facing"})
+        if isinstance(led["channel"], bool) or not isinstance(led["channel"], int):
+            raise TypeError(f"LED number {number}: channel = {led['channel']!r}: a whole number")
+    leds = LedMap(
+        *([led[key] for led in data["leds"]] for key in ("channel", "position", "facing"))
+    )
+    covariance = data["covariance"]
+    return Calibration(
+        Camera.from_dict(data["camera"]),
+        leds,
+        None if data["correction"] is None else Correction.from_dict(data["correction"]),
+        tuple(data["parameters"]),
+        None if covariance is None else check.array("covariance", covariance),
+        math.nan if data["rms"] is None else check.not_negative("rms", data["rms"], "px"),
+        int(check.not_negative("spikes", data["spikes"])),
+        int(check.number("redundancy", data["redundancy"])),
+        data["notes"],
+    )
+
+
+def _refuse_other(where: str, data: Any, fields: set[str]) -> None:
+    """Refuse what is no table of exactly these fields."""
+    if not isinstance(data, dict):
+        raise TypeError(f"{where}{data!r:.60}: a table of {', '.join(sorted(fields))} is needed")
+    if wrong := set(data) ^ fields:
+        raise ValueError(
+            f"{where}unknown or missing: {', '.join(sorted(wrong))}; "
+            f"known are {', '.join(sorted(fields))}"
+        )
+
+
+class UndeterminedError(ValueError):
+    """Observations that cannot determine what they are asked for.
+
+    Attributes
+    ----------
+    parameters : tuple of str
+        What is not determined.
+    calibration : Calibration or None
+        What came out all the same, with its covariance; None where even that cannot be computed.
+    """
+
+    def __init__(
+        self, message: str, parameters: tuple[str, ...], calibration: Calibration | None = None
+    ) -> None:
+        super().__init__(message)
+        self.parameters = parameters
+        self.calibration = calibration
+
+
+def bundle(
+    observations: Sequence[Observation],
+    leds: LedMap,
+    camera: Camera,
+    *,
+    led_sigma: ArrayLike = math.inf,
+    camera_sigma: Mapping[str, float] | None = None,
+    distortion: int = 2,
+    decentring: int = 2,
+    loss: Loss = "cauchy",
+    correction: Correction | None = None,
+    notes: str = "",
+) -> Calibration:
+    """Adjust camera, LEDs and poses at once, so that all spikes fit best.
+
+    Minimised are the squares of all residuals over their σ, those of spikes weakened by `loss`,
+    those of what is known beforehand as they are. What the camera model cannot follow is estimated
+    from the residuals and becomes `Camera.model_error`, which counts in every σ.
+
+    Only bearings are measured, so that nothing tells where the room's origin is, where its x axis
+    points and how large it is, unless LEDs or poses are known: exactly (σ 0) or about (a finite σ).
+
+    Parameters
+    ----------
+    observations : sequence of Observation
+        Of poses all over the area and as far aside as the line sees: 20 or more.
+    leds : LedMap
+        Where the LEDs are, about.
+    camera : Camera
+        To begin with, such as that of `Camera.from_system`.
+    led_sigma : array_like
+        σ with which the LEDs' x and y are known, mm: one for all, shape (N,) or (N, 2). 0 holds
+        them, infinite leaves them to the observations. z is held.
+    camera_sigma : mapping of str to float, optional
+        The same for the camera's numbers, by `Camera.names`. When nothing is said the pupil is known
+        to `PUPIL`, since without turned poses it cannot be told from the LEDs' y; the coupling of
+        height, for which LEDs of different z would be needed, is held; the others are left to the
+        observations.
+    distortion, decentring : int
+        Fewest terms of these kinds; missing ones are added as 0. A head out of the box has more
+        than its drawing: what is tilted is not the same on both sides.
+    loss : {"linear", "huber", "soft_l1", "cauchy"}
+        The last one forgets gross errors; the others let them pull.
+    correction : Correction, optional
+        Passed on.
+    notes : str
+        Passed on, before what is said here.
+
+    Returns
+    -------
+    Calibration
+
+    Raises
+    ------
+    UndeterminedError
+        If the observations do not determine all that was left to them: it names what, and what to
+        do. A straight rail of LEDs seen from unknown poses does not tell the scale.
+    ValueError
+        If an LED is unknown, or a pose cannot be found to begin with.
+    RuntimeError
+        If no minimum is found.
+    """
+    if loss not in get_args(Loss):
+        raise ValueError(f"loss = {loss!r}: allowed are {', '.join(get_args(Loss))}")
+    problem = _Bundle(observations, leds, _with_terms(camera, distortion, decentring))
+    problem.know(led_sigma, camera_sigma or {})
+    problem.refuse_gauge()
+    model_error = FIRST_ERROR
+    for _ in range(REWEIGHTINGS):
+        problem.solve(loss, model_error)
+        before, model_error = model_error, problem.left_over(model_error)
+        if abs(model_error - before) <= 0.02 * model_error:
+            break
+    return problem.result(loss, before, correction, notes)
+
+
+PUPIL = 5.0
+"""mm: σ of the camera's pupil when nothing is said; a drawing gives it to a few."""
+
+FIRST_ERROR = 3.0
+"""px: what the camera model is taken to leave over at first, so that no spike is refused too early."""
+
+REWEIGHTINGS = 12
+"""Most rounds in which what the camera model leaves over is estimated anew."""
+
+_ROOM = {"place along x": 0, "place along y": 1, "orientation": 2, "size": 3}
+
+
+def _with_terms(camera: Camera, distortion: int, decentring: int) -> Camera:
+    """Return the camera with at least so many terms."""
+    terms = {
+        name: (*(old := getattr(camera, name)), *(0.0,) * (check.whole(name, n + 1) - 1 - len(old)))
+        for name, n in (("distortion", distortion), ("decentring", decentring))
+    }
+    return replace(camera, **terms)  # type: ignore[arg-type]
+
+
+def _names(camera: Camera, leds: LedMap) -> tuple[str, ...]:
+    """Names of all that a calibration may estimate."""
+    return (*camera.names, *(f"LED {channel} {axis}" for channel in leds.channels for axis in "xy"))
+
+
+class _Rows(NamedTuple):
+    """Which pose saw which LED: a row for each spike.
+
+    Columns of a Jacobian are the camera's parameters, x and y of every LED, and x, y and heading of
+    every pose.
+    """
+
+    pose: NDArray[np.intp]
+    led: NDArray[np.intp]
+
+    def points(
+        self, positions: NDArray[np.float64], poses: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Optical X, Y and distance of each, shape (rows, 3)."""
+        return np.asarray(optical(positions, *poses.T)[self.pose, self.led])
+
+    def jacobian(
+        self, camera: Camera, positions: NDArray[np.float64], poses: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Change of the spikes with everything, px per unit."""
+        points = self.points(positions, poses)
+        moved = pose_jacobian(camera, positions, *poses.T)[self.pose, self.led].T
+        first = len(camera.names)
+        last = first + 2 * len(positions)
+        jacobian = np.zeros((len(points), last + 3 * len(poses)))
+        jacobian[:, :first] = camera.parameter_jacobian(points)
+        number = np.arange(len(points))
+        for axis in (0, 1):
+            jacobian[number, first + 2 * self.led + axis] = -moved[axis]
+        for axis in (0, 1, 2):
+            jacobian[number, last + 3 * self.pose + axis] = moved[axis]
+        return jacobian
+
+
+class _Bundle:
+    """A bundle's numbers: all of them in one vector, some held, some known about."""
+
+    def __init__(self, observations: Sequence[Observation], leds: LedMap, camera: Camera) -> None:
+        if not observations:
+            raise ValueError(
+                "observations: none; a bundle needs spikes from poses all over the area"
+            )
+        for number, seen in enumerate(observations, start=1):
+            if unknown := set(seen.channels) - set(leds.channels):
+                raise ValueError(
+                    f"observation {number} has LED {min(unknown)}: the map has {list(leds.channels)}"
+                )
+        self.leds, self.camera, self.observations = leds, camera, observations
+        self.rows = _Rows(
+            np.repeat(np.arange(len(observations)), [len(o.channels) for o in observations]),
+            np.array([leds.index(c) for o in observations for c in o.channels], dtype=int),
+        )
+        self.pixels = np.concatenate([np.asarray(o.pixels) for o in observations])
+        self.noise = np.concatenate([np.asarray(o.sigma) for o in observations])
+        self.heights = np.array([o.height for o in observations])
+        self.names = (
+            *_names(camera, leds),
+            *(
+                f"pose {n} {what}"
+                for n in range(1, len(observations) + 1)
+                for what in ("x", "y", "heading")
+            ),
+        )
+        starts = [
+            _start(number, seen, leds, camera) for number, seen in enumerate(observations, start=1)
+        ]
+        self.first = len(camera.names)
+        self.last = self.first + 2 * len(leds)
+        self.values = np.concatenate(
+            [camera.parameters, leds.positions[:, :2].ravel(), np.ravel(starts)]
+        )
+
+    def know(self, led_sigma: ArrayLike, camera_sigma: Mapping[str, float]) -> None:
+        """Take what is known beforehand: a value and a σ for every number."""
+        spread = np.asarray(led_sigma, dtype=float)
+        if spread.shape == (len(self.leds),):
+            spread = spread[:, None]
+        if spread.shape not in {(), (len(self.leds), 1), (len(self.leds), 2)}:
+            raise ValueError(
+                f"led_sigma is one number, or has shape ({len(self.leds)},) or "
+                f"({len(self.leds)}, 2), not {spread.shape}"
+            )
+        if unknown := set(camera_sigma) - set(self.camera.names):
+            raise ValueError(
+                f"camera_sigma: {', '.join(sorted(unknown))}: known are {', '.join(self.camera.names)}"
+            )
+        usual = {"pupil": PUPIL, "coupling": 0.0}
+        of_camera = [
+            camera_sigma.get(name, usual.get(name.partition("[")[0], math.inf))
+            for name in self.camera.names
+        ]
+        poses = np.array([(o.x, o.y, o.heading) for o in self.observations])
+        self.known = self.values.copy()
+        self.known[self.last :] = poses[..., 0].ravel()
+        self.sigma = np.concatenate(
+            [
+                of_camera,
+                np.broadcast_to(spread, (len(self.leds), 2)).ravel(),
+                poses[..., 1].ravel(),
+            ]
+        )
+        if not (self.sigma >= 0).all():
+            wrong = self.sigma[~(self.sigma >= 0)][0]
+            raise ValueError(f"σ = {wrong}: allowed is 0 (held) to infinity (unknown)")
+        self.free = np.flatnonzero(self.sigma > 0)
+        self.prior = np.flatnonzero((self.sigma > 0) & np.isfinite(self.sigma))
+        self.redundancy = len(self.pixels) + len(self.prior) - len(self.free)
+
+    def refuse_gauge(self) -> None:
+        """Refuse a room that may be moved, turned or stretched without anyone noticing."""
+        unit = 1000.0  # mm; of a turn and a stretch, so that all are about as large
+        pairs = np.concatenate(
+            [
+                self.values[self.first : self.last].reshape(-1, 2),
+                self.values[self.last :].reshape(-1, 3)[:, :2],
+            ]
+        )
+        motions = np.zeros((len(self.values), len(_ROOM)))
+        is_pose = np.arange(len(self.values)) >= self.last
+        kind = np.where(is_pose, (np.arange(len(self.values)) - self.last) % 3, -1)
+        kind[self.first : self.last] = np.arange(self.last - self.first) % 2
+        x, y = kind == 0, kind == 1
+        motions[x, 0] = motions[y, 1] = 1
+        motions[x, 2], motions[y, 2] = -pairs[:, 1] / unit, pairs[:, 0] / unit
+        motions[kind == 2, 2] = 1
+        motions[x, 3], motions[y, 3] = pairs[:, 0] / unit, pairs[:, 1] / unit
+        _, strength, basis = np.linalg.svd(motions[np.isfinite(self.sigma)])
+        strength = np.pad(strength, (0, len(_ROOM) - len(strength)))
+        loose = basis[strength <= 1e-6 * max(strength.max(), 1.0)]
+        if not len(loose):
+            return
+        weights = (loose**2).sum(axis=0)
+        names = tuple(f"the room's {name}" for name, at in _ROOM.items() if weights[at] > 0.05)
+        raise UndeterminedError(
+            f"nothing fixes {', '.join(names)}: bearings alone do not. Hold two LEDs (led_sigma = 0 "
+            "for them), or say how well LEDs or poses are known",
+            names,
+        )
+
+    def state(
+        self, free: NDArray[np.float64]
+    ) -> tuple[Camera, NDArray[np.float64], NDArray[np.float64]]:
+        """Camera, positions and poses (x, y, heading, height) for values of the free numbers."""
+        values = self.values.copy()
+        values[self.free] = free
+        positions = self.leds.positions.copy()
+        positions[:, :2] = values[self.first : self.last].reshape(-1, 2)
+        poses = np.column_stack([values[self.last :].reshape(-1, 3), self.heights])
+        return self.camera.with_parameters(values[: self.first]), positions, poses
+
+    def misfit(self, free: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Measured minus expected spikes, px; NaN, which makes a step too long, of no camera."""
+        try:
+            camera, positions, poses = self.state(free)
+        except ValueError:
+            return np.full(len(self.pixels), math.nan)
+        return np.asarray(self.pixels - camera.project(self.rows.points(positions, poses)))
+
+    def weighted(
+        self, free: NDArray[np.float64], spread: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """All residuals over their σ: of spikes, then of what is known beforehand."""
+        values = self.values.copy()
+        values[self.free] = free
+        known = (self.known[self.prior] - values[self.prior]) / self.sigma[self.prior]
+        return np.concatenate([self.misfit(free) / spread, known])
+
+    def slopes(self, free: NDArray[np.float64], spread: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Jacobian of `weighted`."""
+        jacobian = self.rows.jacobian(*self.state(free))[:, self.free]
+        known = np.zeros((len(self.prior), len(self.free)))
+        known[np.arange(len(self.prior)), np.searchsorted(self.free, self.prior)] = 1
+        return -np.vstack([jacobian / spread[:, None], known / self.sigma[self.prior][:, None]])
+
+    def solve(self, loss: Loss, model_error: float) -> None:
+        """Find the minimum from where the numbers are."""
+        from scipy.optimize import least_squares  # type: ignore[import-untyped]  # slow to load
+
+        spread = np.hypot(self.noise, model_error)
+
+        def rho(z: NDArray[np.float64]) -> NDArray[np.float64]:
+            table = np.stack([z, np.ones_like(z), np.zeros_like(z)])
+            table[:, : len(spread)] = _loss(loss, z[: len(spread)])
+            return table
+
+        found = least_squares(
+            self.weighted,
+            self.values[self.free],
+            self.slopes,
+            loss="linear" if loss == "linear" else rho,
+            f_scale=LOSS_SCALE,
+            x_scale="jac",
+            ftol=1e-12,
+            xtol=1e-12,
+            gtol=1e-12,
+            max_nfev=ITERATIONS,
+            kwargs={"spread": spread},
+        )
+        self.values[self.free] = found.x
+        self.converged = bool(found.success)
+
+    def left_over(self, model_error: float) -> float:
+        """What must be added to the spikes' σ so that residuals are as large as they should be, px.
+
+        Half of them are to be below the median of χ² of one degree, whatever the rest are.
+        """
+        from scipy.optimize import brentq
+
+        free = self.values[self.free]
+        basis = np.linalg.qr(self.slopes(free, np.hypot(self.noise, model_error)))[0]
+        # a spike that the fit must follow leaves no residual, whatever its error
+        left = 1 - (basis[: len(self.noise)] ** 2).sum(axis=1)
+        checked = left > REDUNDANT
+        if not checked.any():
+            return 0.0
+        squares = self.misfit(free)[checked] ** 2 / left[checked]
+        noise = self.noise[checked] ** 2
+
+        def excess(error: float) -> float:
+            return float(np.median(squares / (noise + error**2))) - MEDIAN_CHI2
+
+        if excess(0.0) <= 0:
+            return 0.0
+        return float(brentq(excess, 0.0, 2 * math.sqrt(squares.max() / MEDIAN_CHI2), rtol=1e-3))
+
+    def result(
+        self, loss: Loss, model_error: float, correction: Correction | None, notes: str
+    ) -> Calibration:
+        """Return what was found, or refuse it."""
+        free = self.values[self.free]
+        spread = np.hypot(self.noise, model_error)
+        residuals = self.misfit(free)
+        jacobian = self.slopes(free, spread)
+        # a residual that counts less tells less
+        count = len(residuals)
+        jacobian[:count] *= np.sqrt(_loss(loss, (residuals / spread / LOSS_SCALE) ** 2)[1])[:, None]
+        norms = np.linalg.norm(jacobian, axis=0)
+        norms[norms == 0] = 1
+        _, strength, basis = np.linalg.svd(jacobian / norms, full_matrices=False)
+        told = strength > RANK * strength[0]
+        loose = (basis[~told] ** 2).sum(axis=0)
+        half = basis[told] / strength[told, None] / norms
+        covariance = half.T @ half
+        names = np.array(self.names)[self.free]
+        flat = names[loose > 0.01 * loose.max()] if loose.size and loose.max() > 0 else names[:0]
+        sigma = np.sqrt(np.diag(covariance))
+        # what it would do to the spikes that depend on it
+        plain = self.rows.jacobian(*self.state(free))[:, self.free]
+        felt = np.sqrt((plain**2).sum(axis=0) / np.maximum((plain != 0).sum(axis=0), 1))
+        unknown = np.isinf(self.sigma[self.free])
+        adjusted = self.free < self.last
+        weak = names[unknown & adjusted & (sigma * felt > TELLING)]
+        loose_poses = any(name.startswith("pose") for name in flat.tolist())
+        undetermined = tuple(
+            name
+            for name in names[adjusted].tolist()
+            if name in flat.tolist() or name in weak.tolist()
+        ) + (("poses",) if loose_poses else ())
+        keep = np.flatnonzero(adjusted)
+        camera, positions, _ = self.state(free)
+        said = [notes] if notes else []
+        for name, s, before in zip(
+            names[keep], sigma[keep], self.sigma[self.free][keep], strict=True
+        ):
+            if s > 0.9 * before:
+                said.append(
+                    f"{name}: as known beforehand, ± {before:g}; the observations add little."
+                )
+        far = np.flatnonzero(np.abs(residuals) > OUTLIER * spread)
+        said += [
+            f"Observation {self.rows.pose[i] + 1}, LED {self.leds.channels[self.rows.led[i]]}: "
+            f"{residuals[i]:+.3g} px, {abs(residuals[i]) / spread[i]:.0f} σ; "
+            "it counts little."
+            for i in far[:10]
+        ]
+        calibration = Calibration(
+            replace(camera, model_error=model_error),
+            LedMap(self.leds.channels, positions, self.leds.facings),
+            correction,
+            tuple(names[keep].tolist()),
+            covariance[np.ix_(keep, keep)],
+            float(np.sqrt(np.mean(residuals**2))),
+            count,
+            self.redundancy,
+            "\n".join(said),
+        )
+        if undetermined:
+            spreads = dict(zip(names.tolist(), sigma.tolist(), strict=True))
+            values = ", ".join(
+                f"{name} (± {spreads[name]:.3g})" if name in weak.tolist() else name
+                for name in undetermined
+            )
+            raise UndeterminedError(
+                f"the observations do not determine {values}. {_advice(undetermined)}",
+                undetermined,
+                calibration,
+            )
+        if not self.converged:
+            raise RuntimeError(
+                f"no minimum found in {ITERATIONS} steps; residuals are {calibration.rms:.3g} px RMS: "
+                "are the LEDs' places and channels right?"
+            )
+        return calibration
+
+
+REDUNDANT = 0.1
+"""Least part of a spike's error that must show in its residual for it to tell how large errors are."""
+
+MEDIAN_CHI2 = 0.4549
+"""Median of χ² of one degree of freedom."""
+
+ITERATIONS = 200
+"""Most steps of the minimisation."""
+
+
+def _advice(undetermined: tuple[str, ...]) -> str:
+    """Say what would determine these."""
+    if any(name.startswith("LED") for name in undetermined):
+        return "See these LEDs from more poses, farther apart, or say how well LEDs or poses are known."
+    if set(undetermined) <= {"centre", "decentring[0]"}:
+        return (
+            "A line that is shifted shows what a turned head shows: give headings that are known, or "
+            "hold one of the two (camera_sigma), which then says what heading 0 is."
+        )
+    return (
+        "LEDs on a straight line show the same from poses that are turned and moved a little: "
+        "stagger an LED by some 0.3 m toward the tracker, give poses known to a millimetre, or hold "
+        "what is known (camera_sigma)."
+    )
+
+
+def _loss(loss: Loss, z: NDArray[np.float64]) -> NDArray[np.float64]:
+    """ρ(z), ρ′ and ρ″ for squares of residuals z, shape (3, N)."""
+    match loss:
+        case "linear":
+            return np.stack([z, np.ones_like(z), np.zeros_like(z)])
+        case "huber":
+            root = np.sqrt(np.maximum(z, 1.0))
+            within = z <= 1
+            return np.stack(
+                [
+                    np.where(within, z, 2 * root - 1),
+                    1 / root,
+                    np.where(within, 0.0, -0.5 / root**3),
+                ]
+            )
+        case "soft_l1":
+            root = np.sqrt(1 + z)
+            return np.stack([2 * (root - 1), 1 / root, -0.5 / root**3])
+        case "cauchy":
+            return np.stack([np.log1p(z), 1 / (1 + z), -1 / (1 + z) ** 2])
+
+
+def _start(
+    number: int, seen: Observation, leds: LedMap, camera: Camera
+) -> tuple[float, float, float]:
+    """A pose to begin with: what is known of it, and the rest from the spikes."""
+    positions = leds.positions[[leds.index(channel) for channel in seen.channels]]
+    tangents = camera.tangent(seen.pixels)
+    placed = math.isfinite(seen.x.sigma) and math.isfinite(seen.y.sigma)
+    turned = math.isfinite(seen.heading.sigma)
+    x, y, heading = seen.x.value, seen.y.value, seen.heading.value
+    if not placed:
+        try:
+            x, y, heading = closed_form(
+                tangents, positions[:, :2], heading=heading if turned else None
+            )
+        except ValueError as error:
+            raise ValueError(
+                f"observation {number}: {error} Leave it out, or say what is known of its pose"
+            ) from error
+        x += camera.pupil * math.sin(heading)
+        y -= camera.pupil * math.cos(heading)
+    elif not turned:
+        bearing = np.arctan2(positions[:, 0] - x, y - positions[:, 1])
+        heading = float(np.mean(bearing - np.arctan(tangents)))
+    if not (optical(positions, x, y, heading)[:, 2] + camera.pupil > 0).all():
+        raise ValueError(
+            f"observation {number}: from x = {x:.0f}, y = {y:.0f} mm, heading {heading:.3g} rad an "
+            "LED is behind the tracker; are channels, signs and units right?"
+        )
+    return x, y, heading
