@@ -13,6 +13,8 @@ from acquisition.frames import CHANNELS
 from acquisition.links import LinkError, LinkUnavailable
 from raytransfer.designs import DESIGNS, Design, design_text, load_design
 from twin.machine import CLOCK, Machine
+from twin.rooms import FORMAT as ROOM
+from twin.rooms import ROOMS, load_room
 from twin.sensor import Electronics, SensorModel
 from twin.world import World
 
@@ -26,6 +28,9 @@ SPI_CLOCK = 15_625_000
 
 BOOT = 0.01
 """Virtual seconds between power-on and the first call: real hosts come much later."""
+
+LIGHT_STEP = 50e-6
+"""Virtual seconds for which light counts as constant: 50 nm of way at 1 m/s."""
 
 IMAGE = "F401_FW_TCD1304.elf"
 
@@ -85,7 +90,11 @@ class TwinLink:
         self.sensor = SensorModel(seed, electronics, self.world.sensor)
         self.spi_clock = spi_clock
         self.host_latency = host_latency
-        self._rates = np.empty((1 + CHANNELS, self.world.sensor.pixels))
+        self._rates = np.zeros((1 + CHANNELS, self.world.sensor.pixels))
+        self._lit: set[int] = set()
+        self._lit_until = 0
+        self._rates[0] = self.world.ambient_rate() * self.sensor.response
+        self._rates[0] += self.sensor.dark_rates()
         self._light(0)
         figures = self.sensor.electronics
         self.machine = Machine(
@@ -94,7 +103,7 @@ class TwinLink:
             full_well=figures.full_well / figures.transfer_fraction,
             transfer_fraction=figures.transfer_fraction,
             digitise=self._digitise,
-            light=self._light if self.world.moving else None,
+            light=self._light if self.world.changing else None,
             idle_code=int(figures.code(np.array(figures.dark_voltage))),
             record=record,
         )
@@ -102,10 +111,16 @@ class TwinLink:
         self._open = True
 
     def _light(self, cycles: int) -> bool:
-        """Electrons per second: first what is always there, then each LED channel."""
-        self._rates[0] = self.world.ambient_rate() * self.sensor.response
-        self._rates[0] += self.sensor.dark_rates()
-        self._rates[1:] = self.world.rates(cycles / CLOCK) * self.sensor.response
+        """Electrons per second: after what is always there, a row for each LED channel."""
+        if cycles < self._lit_until:  # all LEDs of an exposure ask, one after the other
+            return False
+        self._lit_until = cycles + round(LIGHT_STEP * CLOCK)
+        before, self._lit = self._lit, set()
+        for channel, rate in self.world.lit(cycles / CLOCK):
+            np.multiply(rate, self.sensor.response, out=self._rates[1 + channel])
+            self._lit.add(channel)
+        for channel in before - self._lit:
+            self._rates[1 + channel] = 0.0
         return True
 
     def _digitise(self, charge: NDArray[np.float64], _: int) -> NDArray[np.uint16]:
@@ -165,19 +180,44 @@ def open_twin(argument: str | None = None, **options: Any) -> TwinLink:
     Parameters
     ----------
     argument : str, optional
-        The lens head: a design file, or the name of one of `DESIGNS`; the thesis's when left out.
+        A room or a lens head: a room file or the name of one of `ROOMS`; a design file or the name
+        of one of `DESIGNS`. The thesis's head and room when left out.
     **options
-        For `TwinLink`, without a world if there is an argument.
+        For `TwinLink`, without a world if there is an argument. A room's seed holds if none is
+        given.
+
+    Raises
+    ------
+    LinkUnavailable
+        If there is no such room or design, or something that the twin needs is missing.
+    ValueError
+        If the file is neither, or something in it is wrong.
     """
     if argument is not None:
-        if argument not in DESIGNS and not Path(argument).is_file():
-            raise LinkUnavailable(
-                f"--link twin {argument}: neither a design file nor one of the designs "
-                f"{', '.join(DESIGNS)}"
-            )
-        design = DESIGNS[argument] if argument in DESIGNS else load_design(argument)
-        options["world"] = World(head=design.system, sensor=design.sensor)
+        options = _described(argument) | options
     try:
         return TwinLink(**options)
     except (FileNotFoundError, ImportError) as error:
         raise LinkUnavailable(str(error)) from error
+
+
+def _described(argument: str) -> dict[str, Any]:
+    """Options that a room or a design, by name or file, stands for."""
+    if argument not in DESIGNS and argument not in ROOMS and not Path(argument).is_file():
+        raise LinkUnavailable(
+            f"--link twin {argument}: neither a room file, one of the rooms {', '.join(ROOMS)}, "
+            f"a design file nor one of the designs {', '.join(DESIGNS)}"
+        )
+    if argument in ROOMS or (argument not in DESIGNS and _says(Path(argument), ROOM)):
+        room = load_room(argument)
+        return {"world": room.world, "seed": room.seed}
+    design = DESIGNS[argument] if argument in DESIGNS else load_design(argument)
+    return {"world": World(head=design.system, sensor=design.sensor)}
+
+
+def _says(path: Path, form: str) -> bool:
+    """Whether a file says that it has a format; what cannot be read is left to its reader."""
+    try:
+        return bool(tomllib.loads(path.read_text(encoding="utf-8")).get("format") == form)
+    except ValueError:
+        return False

@@ -1,0 +1,183 @@
+"""Two sensors with the real firmware, one sync line: same exposures, six degrees of freedom."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from acquisition.protocol import Command, Mode
+from raytransfer.designs import DESIGNS
+from tracking.camera import Camera
+from tracking.poses import PoseFlags
+from tracking.space import (
+    MountedCamera,
+    SpaceFix,
+    SpacePose,
+    locate_in_space,
+    spikes_of,
+)
+from tracking.spikes import SpikeFinder
+from twin.machine import CLOCK, TICKS
+from twin.pair import PERPENDICULAR, PULSE, SyncedLink, TwinPair
+from twin.world import STRAIGHT, Led, Pose, World
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from numpy.typing import NDArray
+
+    from acquisition.frames import Frame
+
+HEAD = DESIGNS["slit-4mm"].system
+# no two LEDs share an x or a z, so that none hides another on either line
+WALL = np.array([(100.0 * (k - 4), 200.0 * (k % 2), 100.0 * ((4 * k) % 9 - 4)) for k in range(9)])
+LEDS = [Led(k, (x, y, z), power=0.1, extent=2.0) for k, (x, y, z) in enumerate(WALL.tolist())]
+SINGLY = [{k: 60} for k in range(9)]
+TOGETHER = dict.fromkeys(range(9), 60)
+
+
+@pytest.fixture(scope="module")
+def heads() -> tuple[MountedCamera, ...]:
+    camera = Camera.from_system(HEAD, distances=(1800.0, 2600.0), angles=15, rays=(96, 48))
+    return tuple(MountedCamera(camera, m.roll, m.offset) for m in (STRAIGHT, PERPENDICULAR))
+
+
+def singly(frames: Iterable[tuple[Frame, ...]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Spikes and their σ of frames with one LED each."""
+    finder = SpikeFinder(limit=1)
+    pixels, sigma = np.full((2, 9), np.nan), np.full((2, 9), np.inf)
+    for pair in frames:
+        for sensor, frame in enumerate(pair):
+            (led,) = frame.channels
+            for spike in finder(frame):
+                pixels[sensor, led], sigma[sensor, led] = spike.position, spike.sigma
+    return pixels, sigma
+
+
+def together(
+    pair: tuple[Frame, ...], expected: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Spikes and their σ of frames with all LEDs, near where they are expected."""
+    finder = SpikeFinder()
+    pixels, sigma = np.full((2, 9), np.nan), np.full((2, 9), np.inf)
+    for sensor, frame in enumerate(pair):
+        leds = np.flatnonzero(np.abs(expected[sensor] - 1823.5) < 1780)
+        places = np.rint(expected[sensor, leds]).astype(int)
+        spikes = finder(frame, windows=[(int(p) - 30, int(p) + 30) for p in places])
+        for led, spike in zip(leds, spikes, strict=True):
+            pixels[sensor, led], sigma[sensor, led] = spike.position, spike.sigma
+    return pixels, sigma
+
+
+def off(fix: SpaceFix, pose: Pose) -> NDArray[np.float64]:
+    return np.array(
+        [
+            getattr(fix.pose, n) - getattr(pose, n)
+            for n in ("x", "y", "z", "heading", "pitch", "roll")
+        ]
+    )
+
+
+def as_spoken(pose: Pose) -> SpacePose:
+    return SpacePose(pose.x, pose.y, pose.z, pose.heading, pose.pitch, pose.roll)
+
+
+def test_both_expose_at_the_same_time_and_see_from_their_own_mounts(
+    heads: tuple[MountedCamera, ...],
+) -> None:
+    """To the cycle: timestamps are equal, light is each head's own, the pose that of the tracker."""
+    pose = Pose(60.0, 2200.0, -0.02, -40.0, 0.015, 0.05)
+    command = Command(1000, 16000, 9, Mode.STREAM, SINGLY)
+    with TwinPair(World(LEDS, pose, head=HEAD)) as pair:
+        frames = list(pair.capture(command))
+        exposed = [link.machine.readouts["transfer"][-9:] for link in pair.links]
+    assert len(frames) == 9
+    for number, (one, other) in enumerate(frames):
+        assert one.sequence == other.sequence == number
+        assert one.timestamp == other.timestamp
+        assert one.channels == other.channels == (number,)
+        assert not np.array_equal(one.pixels, other.pixels)
+    assert exposed[0].tolist() == exposed[1].tolist()  # cycles
+    pixels, sigma = singly(frames)
+    expected = spikes_of(heads, WALL, as_spoken(pose))
+    seen = np.isfinite(pixels)
+    assert seen.all()
+    residuals = (pixels - expected)[seen]
+    print("residuals:", residuals.round(3), "sigma:", sigma[seen].round(3))
+    assert np.abs(residuals).max() < 0.1
+    fix = locate_in_space(heads, WALL, pixels, sigma)
+    error = off(fix, pose)
+    print("still:", error.round(4))
+    assert not fix.flags & PoseFlags.AMBIGUOUS
+    assert np.abs(error[:3]).max() < 0.4  # mm
+    assert np.abs(error[3:]).max() < 2e-4  # rad
+
+
+def test_a_tracker_that_moves_and_turns_is_followed(heads: tuple[MountedCamera, ...]) -> None:
+    """All LEDs in each frame: after nine with one each, to begin with, no pose is ever told."""
+
+    def tracker(seconds: float) -> Pose:
+        swing = math.sin(6 * seconds)
+        return Pose(
+            30 * swing, 2200 + 300 * seconds, 0.01 * swing, 20 - 100 * seconds, 0.02, 0.03 * swing
+        )
+
+    sequence = [*SINGLY, *[TOGETHER] * 12]
+    command = Command(1000, 16000, len(sequence), Mode.STREAM, sequence)
+    with TwinPair(World(LEDS, tracker, head=HEAD)) as pair:
+        frames = list(pair.capture(command))
+        ended = pair.links[0].machine.readouts["transfer"] / CLOCK
+    assert len(frames) == len(sequence)
+    # the device counts from when it has booted, the world from when it was switched on
+    stamps = np.array([(one.timestamp or 0) * 1e-9 for one, _ in frames])
+    boot = np.abs(ended[:, None] - stamps).min()
+    print(f"boot: {boot * 1e3:.3f} ms")
+    near = locate_in_space(heads, WALL, *singly(frames[:9])).pose
+    errors = []
+    for one, other in frames[9:]:
+        assert one.timestamp == other.timestamp
+        fix = locate_in_space(
+            heads, WALL, *together((one, other), spikes_of(heads, WALL, near)), start=near
+        )
+        near = fix.pose
+        assert one.timestamp is not None
+        errors.append(off(fix, tracker(boot + one.timestamp * 1e-9)))
+    errors_rms = np.sqrt(np.mean(np.square(errors), axis=0))
+    print("moving:", errors_rms.round(5))
+    assert (errors_rms[:3] < 0.4).all()  # mm
+    assert (errors_rms[3:] < 2e-4).all()  # rad
+
+
+def test_an_edge_comes_when_it_was_said_to_whatever_the_host_does() -> None:
+    """During a transfer, a wait and a sleep; told by the pulls of the driver itself."""
+    driven: list[tuple[int, bool | None]] = []
+    with SyncedLink() as link:
+        drive = link.machine.drive
+
+        def watched(pin: str, level: bool | None) -> None:
+            assert pin == "PB1"
+            driven.append((link.ticks, level))
+            drive(pin, level)
+
+        link.machine.drive = watched  # type: ignore[method-assign]
+        pulse, begun = round(PULSE * TICKS), link.ticks
+        for step, pass_time in (
+            (TICKS // 1000, lambda: link.transfer(bytes(7388))),
+            (TICKS // 1000, lambda: link.wait_ready(0.01)),
+            (TICKS // 1000, lambda: link.sleep(0.01)),
+        ):
+            driven.clear()
+            at = link.ticks + step
+            link.pulse_at(at)
+            pass_time()
+            assert driven == [(at, True), (at + pulse, False)]
+        with pytest.raises(ValueError, match="already"):
+            link.pulse_at(begun)
+
+
+def test_a_delay_out_of_range_is_refused() -> None:
+    with TwinPair(World()) as pair, pytest.raises(ValueError, match="in ms"):
+        next(pair.capture(Command(1000, 16000, 1, Mode.STREAM), delay=50))
