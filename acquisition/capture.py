@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
 import numpy as np
 
-from acquisition.frames import MASTER_CLOCK, Frame, FrameFlags
+from acquisition.frames import MASTER_CLOCK, Frame, FrameFlags, SpikeFrame
 from acquisition.links import Link, LinkEnded, LinkError, LinkTimeout, pause
 from acquisition.protocol import (
     ORIGINAL_SIZE,
-    STREAM_SIZE,
+    SIZES,
     BadHeader,
     BadVersion,
     Command,
@@ -31,6 +31,7 @@ from acquisition.protocol import (
     Status,
     decode_elements,
     decode_frame,
+    decode_spikes,
 )
 from acquisition.wiring import PROTOCOL
 
@@ -54,7 +55,7 @@ _SILENCE: Final = (4, 20e-3, 5e-3)  # read-outs, or s; slack, s: longer, no runn
 _UNCONFIRMED: Final = 8  # frames until a command that nothing came of is sent again
 _SEQUENCES: Final = 1 << 32
 _SLICE: Final = 0.1  # s; how long an interruption may go unnoticed
-_ZEROS: Final = {size: bytes(size) for size in (ORIGINAL_SIZE, STREAM_SIZE)}
+_ZEROS: Final = {size: bytes(size) for size in SIZES}
 
 
 class Refused(LinkError):  # noqa: N818
@@ -88,11 +89,11 @@ class CaptureStatistics:
     invalid : int
         Frames delivered with the flag `FrameFlags.INVALID`: in original mode, or so recorded.
     dropped : int
-        Stream mode: read-outs missing in the sequence, lost by the device or on the link.
+        Stream and spikes mode: read-outs missing in the sequence, lost by the device or on the link.
     corrupt : int
-        Stream mode: transfers that arrived damaged; none of them is delivered.
+        Stream and spikes mode: transfers that arrived damaged; none of them is delivered.
     stale : int
-        Stream mode: frames of an earlier command, or sent twice; not delivered either.
+        Stream and spikes mode: frames of an earlier command, or sent twice; not delivered either.
     timeouts : int
         Times the device did not offer anything in time.
     restarts : int
@@ -149,7 +150,8 @@ class Capture:
     """A capture under way: an iterator of frames that can be looked at and steered meanwhile.
 
     Used in a ``with`` statement it is closed in any case: a device in the middle of an endless
-    stream is told to stop. The link stays open.
+    stream is told to stop. The link stays open. In spikes mode the frames are `SpikeFrame`: see
+    `SpikeCapture`. All that is said of stream mode holds there, too.
 
     Parameters
     ----------
@@ -158,10 +160,11 @@ class Capture:
     command : Command
     timeout : float, optional
         How long the device may be silent, s. By default six read-outs and a flush, and a quarter
-        of a second for the host; while a stream runs, four read-outs or 20 ms.
+        of a second for the host; while a stream runs, four read-outs or 20 ms. With
+        ``await_sync``, the edge has to come within it, or the command is sent again.
     retries : int, optional
         How often a command is sent again before the capture fails. Counted anew after each good
-        frame.
+        frame. Once frames have come, one sent again does not await an edge any more.
     firmware : {"linetrack", "original"}, optional
         "original": the published one, which sends one frame more than asked for.
     master_clock : float, optional
@@ -217,6 +220,7 @@ class Capture:
         self._missing = 0  # frames still to come of the command under way
         self._came: tuple[int, int] | None = None  # frames of the last command that came, asked for
         # stream mode
+        self._await_sync = command.await_sync
         self._command = command  # whose LED sequence is in force
         self._pending: Command | None = None  # sent, without an answer yet
         self._queued: Command | None = None  # to be sent with the next transfer
@@ -230,7 +234,7 @@ class Capture:
         self._base: int | None = 0  # the frame that the LED sequence began with; None: unknown
         self._settled = False  # a frame has come since the device's last (re)start
         self._refusal: Refusal | None = None
-        self._frames = self._stream() if command.mode is Mode.STREAM else self._original()
+        self._frames = self._original() if command.mode is Mode.ORIGINAL else self._stream()
 
     def __iter__(self) -> Self:
         return self
@@ -296,24 +300,28 @@ class Capture:
         Parameters
         ----------
         change : Command, or sequence of mapping of int to int
-            A new command, or only a new LED sequence as in `Command`. Frames go on being counted:
-            the capture ends after as many as it was begun for.
+            A new command, or only a new LED sequence as in `Command`, in spikes mode for the whole
+            line. Frames go on being counted: the capture ends after as many as it was begun for.
 
         Raises
         ------
         CommandError
-            The sequence is not possible.
+            The sequence is not possible; in spikes mode, it has more than 14 entries.
         ValueError
-            The capture, or the command, is in original mode.
+            The capture is in original mode, or the command in another one than the capture.
         """
-        if self._command.mode is not Mode.STREAM:
+        mode = self._command.mode
+        if mode is Mode.ORIGINAL:
             raise ValueError("original mode takes one command for each capture; use stream mode")
         if not isinstance(change, Command):
-            change = replace(self._newest(), sequence=change)
-        if change.mode is not Mode.STREAM:
+            change = replace(self._newest(), sequence=change, windows=())
+        if change.mode is not mode:
             raise ValueError(
-                "a running stream cannot go over to original mode; begin a new capture"
+                f"a running capture in {mode.name.lower()} mode cannot go over to "
+                f"{change.mode.name.lower()} mode; begin a new one"
             )
+        change = replace(change, await_sync=False)
+        change.encode(SIZES[mode])  # or raise, here where the command comes from
         self._queued = change
         if self._pending is None:
             self._tries = 0
@@ -471,7 +479,7 @@ class Capture:
 
     # --- stream mode
 
-    def _stream(self) -> Generator[Frame]:
+    def _stream(self) -> Generator[Any]:
         total = self._command.count
         try:
             with suppress(LinkEnded):
@@ -490,7 +498,10 @@ class Capture:
         self._settled = False
         self._pause(_BREATH)
         self._running = True
-        self._link.transfer(replace(command, count=self._left()).encode(ORIGINAL_SIZE))
+        # once frames have come, a restart does not wait for another edge, which may never come
+        sync = self._await_sync and self._number < 0
+        command = replace(command, count=self._left(), await_sync=sync)
+        self._link.transfer(command.encode(ORIGINAL_SIZE))
 
     def _left(self) -> int:
         """How many frames are still to come; 0 if there is no end."""
@@ -507,7 +518,7 @@ class Capture:
         self._doubtful = True
         self._issue(self._newest())
 
-    def _next_frame(self) -> Frame | None:
+    def _next_frame(self) -> Frame | SpikeFrame | None:
         """Do one transfer; None if it brought no frame to deliver."""
         link, statistics = self._link, self.statistics
         ready = self._wait_ready(self._patience)
@@ -521,7 +532,7 @@ class Capture:
         data = link.transfer(self._outgoing())
         utc_ns, monotonic_ns = time.time_ns(), time.monotonic_ns()
         try:
-            item = decode_frame(
+            item = (decode_spikes if self._command.mode is Mode.SPIKES else decode_frame)(
                 data, master_clock=self._clock, utc_ns=utc_ns, monotonic_ns=monotonic_ns
             )
         except (BadVersion, BadHeader) as error:
@@ -545,11 +556,11 @@ class Capture:
         """Return what to send while reading: the command queued, or zeros."""
         queued = self._queued
         if queued is None or self._pending is not None or not self._settled:
-            return _ZEROS[STREAM_SIZE]
+            return _ZEROS[self._command.size]
         self._pending, self._queued, self._age = queued, None, 0
         self._doubtful &= self._tries > 0
         self._tries += 1
-        return replace(queued, count=self._left()).encode(STREAM_SIZE)
+        return replace(queued, count=self._left()).encode(queued.size)
 
     def _answered(self, status: Status) -> None:
         """Take the device's answer to a command."""
@@ -591,7 +602,7 @@ class Capture:
             )
         self._repeat()
 
-    def _accepted(self, frame: Frame) -> Frame | None:
+    def _accepted(self, frame: Frame | SpikeFrame) -> Frame | SpikeFrame | None:
         """Number a good frame and tell its exposures; None if it is none of this capture's."""
         changed = bool(frame.flags & FrameFlags.CHANGED)
         if changed:
@@ -638,13 +649,13 @@ class Capture:
             flags=flags | self._lost_flag(),
         )
 
-    def _behind(self, frame: Frame) -> bool:
+    def _behind(self, frame: Frame | SpikeFrame) -> bool:
         """Whether a frame of this number has been delivered already."""
         if self._expected is None:
             return False
         return (frame.sequence - self._expected) % _SEQUENCES >= _SEQUENCES // 2
 
-    def _exposures(self, frame: Frame) -> Mapping[int, int]:
+    def _exposures(self, frame: Frame | SpikeFrame) -> Mapping[int, int]:
         """Find the frame in the LED sequence: at its place, or else the only one that fits.
 
         The device sends the mask alone. Where a new sequence may be in force already without its
@@ -664,12 +675,30 @@ class Capture:
     def _stop(self) -> None:
         """Leave the device with its LEDs off: one more unlit frame, and no other."""
         self._running = False
-        last = replace(self._command, count=1, sequence=[{}])
+        last = replace(self._command, count=1, sequence=[{}], windows=(), await_sync=False)
         with suppress(LinkError, OSError):
             pause(self._link, _QUIET)
             longest = _SLICE if self._interrupted else float("inf")
             self._link.wait_ready(min(2 * self._command.icg_period / self._clock, longest))
-            self._link.transfer(last.encode(STREAM_SIZE))
+            self._link.transfer(last.encode(last.size))
+
+
+class SpikeCapture(Capture):
+    """A `Capture` in spikes mode, for type checkers: its frames are `SpikeFrame`.
+
+    Raises
+    ------
+    ValueError
+        The command is in another mode.
+    """
+
+    def __init__(self, link: Link, command: Command, **options: Any) -> None:
+        if command.mode is not Mode.SPIKES:
+            raise ValueError(f"mode = {command.mode.name}: Mode.SPIKES is needed here")
+        super().__init__(link, command, **options)
+
+    def __next__(self) -> SpikeFrame:  # type: ignore[override]
+        return super().__next__()  # type: ignore[return-value]
 
 
 def _mask(lit: Mapping[int, int]) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import IntFlag
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
 import numpy as np
 
@@ -57,8 +57,38 @@ class FrameFlags(IntFlag):
     """Frames before this one came damaged or not at all. Without LEDs, those may be unknown."""
 
 
+class _Readout:
+    """What every read-out is described by."""
+
+    leds: int
+    sh_period: int
+    master_clock: int
+
+    def _check(self) -> None:
+        if self.master_clock <= 0:
+            raise ValueError(f"master_clock = {self.master_clock} Hz: allowed is > 0")
+        if not 0 <= self.leds < 1 << CHANNELS:
+            raise ValueError(f"leds = {self.leds:#x}: a mask of {CHANNELS} bits is needed")
+
+    @property
+    def integration_time(self) -> float:
+        """How long the sensor gathered light, s; 0 if the SH period is unknown."""
+        return self.sh_period / self.master_clock
+
+    @property
+    def channels(self) -> tuple[int, ...]:
+        """Channels of the LEDs lit, ascending."""
+        return tuple(n for n in range(self.leds.bit_length()) if self.leds >> n & 1)
+
+    def replaced(self, **values: Any) -> Self:
+        """Return a copy with other values (not pixels), as `dataclasses.replace` but unchecked."""
+        result = object.__new__(type(self))
+        result.__dict__.update(self.__dict__, **values)
+        return result
+
+
 @dataclass(frozen=True, eq=False)
-class Frame:
+class Frame(_Readout):
     """One read-out of the sensor.
 
     Parameters
@@ -116,10 +146,7 @@ class Frame:
             elements = elements.view()
             elements.flags.writeable = False
         object.__setattr__(self, "elements", elements)
-        if self.master_clock <= 0:
-            raise ValueError(f"master_clock = {self.master_clock} Hz: allowed is > 0")
-        if not 0 <= self.leds < 1 << CHANNELS:
-            raise ValueError(f"leds = {self.leds:#x}: a mask of {CHANNELS} bits is needed")
+        self._check()
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Frame):
@@ -144,26 +171,10 @@ class Frame:
         """The 13 light-shielded elements D16 to D28 (a view)."""
         return self.elements[DARK]
 
-    @property
-    def integration_time(self) -> float:
-        """How long the sensor gathered light, s; 0 if the SH period is unknown."""
-        return self.sh_period / self.master_clock
-
-    @property
-    def channels(self) -> tuple[int, ...]:
-        """Channels of the LEDs lit, ascending."""
-        return tuple(n for n in range(self.leds.bit_length()) if self.leds >> n & 1)
-
     @cached_property
     def dark_level(self) -> float:
         """Median of the dark reference, in counts."""
         return float(np.median(self.dark))
-
-    def replaced(self, **values: Any) -> Frame:
-        """Return a copy with other values (not elements), as `dataclasses.replace` but unchecked."""
-        result = object.__new__(type(self))
-        result.__dict__.update(self.__dict__, **values)
-        return result
 
     def invalid(self) -> list[str]:
         """Tell what in the frame no sensor can have sent; an empty list if nothing is seen.
@@ -217,6 +228,69 @@ class Frame:
                 "it: the frame is shifted, a byte was changed, or the output is inverted"
             )
         return result
+
+
+class OnboardSpike(NamedTuple):
+    """A spike that the firmware found (its firmware/spikes.c says how).
+
+    Parameters
+    ----------
+    position : float
+        px, 0 the middle of the first pixel, in steps of 1/1024.
+    width : float
+        Full width at half maximum, px, in steps of 1/16.
+    height : int
+        Of its peak above its base, counts.
+    flags : int
+        1 saturated, 2 clipped by the window or the line, 4 double, 8 a weaker one is near: as in
+        `tracking.spikes.SpikeFlags`.
+    window : int
+        Which of the frame's windows it is in.
+    """
+
+    position: float
+    width: float
+    height: int
+    flags: int
+    window: int
+
+
+@dataclass(frozen=True)
+class SpikeFrame(_Readout):
+    """What the firmware found in one read-out, in spikes mode.
+
+    Parameters
+    ----------
+    spikes : tuple of OnboardSpike
+        Window after window, the highest of each first; 8 at most. Empty: there was none.
+    windows : tuple of tuple of int
+        First and last pixel of each window that was looked through.
+    dark_level : float
+        Mean of the dark reference, counts, in steps of 1/16.
+    sequence, leds, exposures, sh_period, icg_period, master_clock
+        As those of a `Frame`.
+    timestamp, utc_ns, monotonic_ns, flags
+        As those of a `Frame`.
+    """
+
+    spikes: tuple[OnboardSpike, ...]
+    windows: tuple[tuple[int, int], ...] = ((0, PIXELS - 1),)
+    dark_level: float = 0.0
+    sequence: int = 0
+    leds: int = 0
+    exposures: Mapping[int, int] = field(default_factory=dict)
+    sh_period: int = 0
+    icg_period: int = 0
+    master_clock: int = MASTER_CLOCK
+    timestamp: int | None = None
+    utc_ns: int = 0
+    monotonic_ns: int = 0
+    flags: FrameFlags = FrameFlags.NONE
+
+    __hash__ = None  # type: ignore[assignment]  # it holds a mapping
+
+    def __post_init__(self) -> None:
+        self._check()
 
 
 def stack(frames: Sequence[Frame]) -> dict[str, NDArray[Any]]:

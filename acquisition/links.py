@@ -482,6 +482,11 @@ class ReplayLink(_Closing):
         return rx
 
     def _take(self, command: Command) -> None:
+        if command.mode is Mode.SPIKES:
+            raise LinkError(
+                "a recording has pixels, but no firmware that looks for spikes in them: replay it "
+                "in stream mode"
+            )
         self._periods = (command.sh_period, command.icg_period)
         streaming = self._mode is Mode.STREAM and self._left > 0
         self._mode = command.mode

@@ -1,8 +1,9 @@
 """The bytes on the wire: commands to the microcontroller, frames from it, their checksum.
 
-Two framings share the command. In *original* mode every transfer has 7388 bytes, the elements of
+Three framings share the command. In *original* mode every transfer has 7388 bytes, the elements of
 one read-out, low byte first, with neither header nor checksum. In *stream* mode every transfer has
-7424 bytes: a header of 32 bytes, the elements and a checksum, all little-endian.
+7424 bytes: a header of 32 bytes, the elements and a checksum, all little-endian. In *spikes* mode
+it has 256: the same header, what the firmware found in the elements, and a checksum.
 
 The checksum is that of the microcontroller's CRC unit: CRC-32/MPEG-2 (polynomial 0x04C11DB7,
 initial value 0xFFFFFFFF, nothing reflected, nothing inverted) over 32-bit words, where a word is
@@ -21,18 +22,43 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from acquisition.frames import CHANNELS, ELEMENTS, MASTER_CLOCK, Frame, FrameFlags
+from acquisition.frames import (
+    CHANNELS,
+    ELEMENTS,
+    FULL_SCALE,
+    MASTER_CLOCK,
+    PIXELS,
+    Frame,
+    FrameFlags,
+    OnboardSpike,
+    SpikeFrame,
+)
 from acquisition.wiring import PROTOCOL, WIRING
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _STREAM: Final = PROTOCOL.stream
+_SPIKES: Final = PROTOCOL.spikes
 
 ORIGINAL_SIZE: Final = PROTOCOL.original_size
 """Bytes of every transfer in original mode."""
 STREAM_SIZE: Final = _STREAM.frame_size
 """Bytes of every transfer in stream mode."""
+SPIKES_SIZE: Final = PROTOCOL.spikes.frame_size
+"""Bytes of every transfer in spikes mode."""
+SIZES: Final = (ORIGINAL_SIZE, STREAM_SIZE, SPIKES_SIZE)
+"""Bytes of a transfer by `Mode`."""
+SPIKES_MAX: Final = PROTOCOL.spikes.spikes_max
+"""Largest number of spikes in a frame."""
+WINDOWS_MAX: Final = PROTOCOL.spikes.windows_max
+"""Largest number of windows of a frame."""
+WINDOW_MIN: Final = PROTOCOL.spikes.window_min
+"""Shortest window, pixels."""
+FULL_WINDOW: Final = (0, PIXELS - 1)
+"""The window that is the whole line."""
+SATURATED: Final = PROTOCOL.spikes.saturated
+"""Code at or below which a pixel counts as full, by default."""
 COMMAND_MAGIC: Final = bytes(PROTOCOL.command_magic)
 """What a command begins with."""
 SH_MIN: Final = PROTOCOL.sh_min
@@ -58,8 +84,14 @@ _CONTINUES: Final = _STREAM.exposure_continues
 _HEADER: Final = struct.Struct("<HBBIQQII")
 _ENTRY: Final = struct.Struct("<QI")
 _STATUS: Final = struct.Struct("<II32s")
-_CRC_AT: Final = STREAM_SIZE - 4
-_ELEMENTS: Final = slice(_HEADER.size, _HEADER.size + 2 * ELEMENTS)
+_WINDOWED_ENTRY: Final = struct.Struct("<QIHH")
+_LIMITS: Final = struct.Struct("<HH")
+_FOUND: Final = struct.Struct("<BBHI")
+_WINDOW: Final = struct.Struct("<HH")
+_SPIKE: Final = struct.Struct("<IHHBB2x")
+_NO_WINDOW: Final = (_SPIKES.no_window, _SPIKES.no_window)
+_AWAIT_SYNC: Final = PROTOCOL.options["await_sync"]
+_BRIEF: Final = PROTOCOL.options["brief"]
 _STATUS_FLAG: Final = int(FrameFlags.STATUS)
 _KNOWN_FLAGS: Final = int(
     FrameFlags.DROPPED | FrameFlags.CHANGED | FrameFlags.REFUSED | FrameFlags.STATUS
@@ -73,7 +105,7 @@ class Mode(IntEnum):
     ORIGINAL = PROTOCOL.modes["original"]
     STREAM = PROTOCOL.modes["stream"]
     SPIKES = PROTOCOL.modes["spikes"]
-    """Reserved."""
+    """As stream mode, but frames are the spikes that the firmware found: `SpikeFrame`."""
 
 
 class Refusal(IntEnum):
@@ -178,11 +210,22 @@ class Command:
         Frames, 1 to 65535; in stream mode 0 means endless.
     mode : Mode, optional
     sequence : sequence of mapping of int to int, optional
-        Stream mode: which LEDs are lit during each frame, over and over. One mapping for each
-        frame, from channel (0 to 5 on pins, 6 to 63 on the chain) to the LED's time in master
-        clocks, 10 up to the SH period, at the end of the integration; an empty mapping is an
-        unlit frame. Without any, one LED each in turn, for the whole integration: the two that
+        Stream and spikes mode: which LEDs are lit during each frame, over and over. One mapping
+        for each frame, from channel (0 to 5 on pins, 6 to 63 on the chain) to the LED's time in
+        master clocks, 10 up to the SH period, at the end of the integration; an empty mapping is
+        an unlit frame. Without any, one LED each in turn, for the whole integration: the two that
         original mode lights.
+    windows : sequence of sequence of tuple of int, optional
+        Spikes mode: where spikes are looked for in each frame of the sequence, as first and last
+        pixel, 16 pixels at least; 8 windows a frame at most. An empty one, or none given, is the
+        whole line, (0, 3647).
+    saturated : int, optional
+        Spikes mode: the code at or below which a pixel is full; 0 if that is unknown.
+    threshold : int, optional
+        Spikes mode: how high a spike must be at least, in counts; 0: above the noise.
+    await_sync : bool, optional
+        Stream and spikes mode: begin with the next rising edge on the line `sync`, so that all
+        microcontrollers that see it read out together. Until then no frame comes.
 
     Raises
     ------
@@ -195,15 +238,20 @@ class Command:
     count: int
     mode: Mode = Mode.ORIGINAL
     sequence: Sequence[Mapping[int, int]] = field(default=())
+    windows: Sequence[Sequence[tuple[int, int]]] = field(default=())
+    saturated: int = SATURATED
+    threshold: int = 0
+    await_sync: bool = False
 
     def __post_init__(self) -> None:
         check_periods(self.sh_period, self.icg_period)
-        if self.mode not in (Mode.ORIGINAL, Mode.STREAM):
+        if self.mode not in tuple(Mode):
             raise CommandError(
-                f"mode = {self.mode!r}: allowed are Mode.ORIGINAL and Mode.STREAM", Refusal.MODE
+                f"mode = {self.mode!r}: allowed are Mode.ORIGINAL, Mode.STREAM and Mode.SPIKES",
+                Refusal.MODE,
             )
         object.__setattr__(self, "mode", Mode(self.mode))
-        lowest = 0 if self.mode is Mode.STREAM else 1
+        lowest = 1 if self.mode is Mode.ORIGINAL else 0
         count = _whole("count (-n)", self.count, Refusal.PERIODS)
         if not lowest <= count <= COUNT_MAX:
             raise CommandError(
@@ -216,27 +264,53 @@ class Command:
                 "sequence: original mode lights its two LEDs itself; was stream mode meant?",
                 Refusal.MODE,
             )
+        if self.mode is Mode.ORIGINAL and self.await_sync:
+            raise CommandError(
+                "await_sync: original mode begins at once; was stream mode meant?", Refusal.MODE
+            )
+        if self.mode is not Mode.SPIKES and len(self.windows):
+            raise CommandError(
+                "windows: only spikes mode has them; was Mode.SPIKES meant?", Refusal.MODE
+            )
+        for name in ("saturated", "threshold"):
+            value = _whole(name, getattr(self, name), Refusal.TABLE)
+            if not 0 <= value <= FULL_SCALE:
+                raise CommandError(
+                    f"{name} = {value}: allowed are 0 to {FULL_SCALE} counts", Refusal.TABLE
+                )
         object.__setattr__(self, "sequence", self._checked_sequence())
+        object.__setattr__(self, "windows", self._checked_windows())
+        entries = len(self._table())
+        if entries > TABLE_MAX:
+            raise CommandError(
+                f"sequence: its {len(self.sequence)} frames need {entries} entries, one for each "
+                f"different exposure or window of a frame; the device's table holds {TABLE_MAX}",
+                Refusal.TABLE,
+            )
 
     def _checked_sequence(self) -> tuple[dict[int, int], ...]:
         if self.mode is Mode.ORIGINAL:
             return ()
         longest = min(self.sh_period, _CONTINUES - 1)
         given = self.sequence if len(self.sequence) else [{n: longest} for n in LAST_TWO]
-        result = tuple(_checked_exposures(n, lit, self.sh_period) for n, lit in enumerate(given))
-        entries = sum(len(_steps(lit)) for lit in result)
-        if entries > TABLE_MAX:
+        return tuple(_checked_exposures(n, lit, self.sh_period) for n, lit in enumerate(given))
+
+    def _checked_windows(self) -> tuple[tuple[tuple[int, int], ...], ...]:
+        if self.mode is not Mode.SPIKES:
+            return ()
+        given = self.windows if len(self.windows) else [()] * len(self.sequence)
+        if len(given) != len(self.sequence):
             raise CommandError(
-                f"sequence: its {len(result)} frames need {entries} entries, one for each "
-                f"different exposure of a frame; the device's table holds {TABLE_MAX}",
+                f"windows: {len(given)} for a sequence of {len(self.sequence)} frames; each frame "
+                "has its own",
                 Refusal.TABLE,
             )
-        return result
+        return tuple(_checked_windows(n, of_frame) for n, of_frame in enumerate(given))
 
     @property
     def size(self) -> int:
         """Bytes of one transfer in this command's mode."""
-        return STREAM_SIZE if self.mode is Mode.STREAM else ORIGINAL_SIZE
+        return SIZES[self.mode]
 
     def frame_rate(self, master_clock: int = MASTER_CLOCK) -> float:
         """Read-outs per second at a master clock in Hz."""
@@ -255,7 +329,7 @@ class Command:
         mapping of int to int
             Exposure in master clocks by LED channel.
         """
-        if self.mode is Mode.STREAM:
+        if self.mode is not Mode.ORIGINAL:
             return self.sequence[index % len(self.sequence)]
         remaining = self.count - 1 - index
         return {LAST_TWO[1 - remaining]: self.sh_period} if 0 <= remaining <= 1 else {}
@@ -267,17 +341,23 @@ class Command:
         ----------
         size : int, optional
             Length of the transfer, filled up with zeros: 7388 when the device is in original mode
-            or its mode is unknown (the default), 7424 when it is in stream mode.
+            or its mode is unknown (the default), 7424 when it is in stream mode, 256 in spikes
+            mode.
 
         Returns
         -------
         bytes
+
+        Raises
+        ------
+        CommandError
+            It does not fit into a transfer of 256 bytes.
         """
         size = ORIGINAL_SIZE if size is None else size
-        if size not in (ORIGINAL_SIZE, STREAM_SIZE):
+        if size not in SIZES:
             raise ValueError(
-                f"size = {size}: transfers have {ORIGINAL_SIZE} bytes in original mode and "
-                f"{STREAM_SIZE} in stream mode"
+                f"size = {size}: transfers have {ORIGINAL_SIZE} bytes in original mode, "
+                f"{STREAM_SIZE} in stream mode and {SPIKES_SIZE} in spikes mode"
             )
         result = (
             COMMAND_MAGIC
@@ -285,17 +365,32 @@ class Command:
         )  # fmt: skip
         if self.mode is not Mode.ORIGINAL:
             table = self._table()
-            result += bytes([_STREAM.version, len(table), 0])
-            result += b"".join(_ENTRY.pack(*entry) for entry in table)
+            options = _AWAIT_SYNC if self.await_sync else 0
+            options |= _BRIEF if size == SPIKES_SIZE else 0
+            plain = self.mode is Mode.STREAM and not options
+            result += bytes([_STREAM.version if plain else _SPIKES.version, len(table), options])
+            if self.mode is Mode.SPIKES:
+                result += _LIMITS.pack(self.saturated, self.threshold)
+            result += b"".join(table)
             result += crc32_words(result).to_bytes(4, "little")
+        if len(result) > size:
+            raise CommandError(
+                f"sequence: its {len(table)} entries do not fit into a transfer of spikes mode, "
+                f"{size} bytes; a running stream takes fewer, a new capture up to {TABLE_MAX}",
+                Refusal.TABLE,
+            )
         return result.ljust(size, b"\0")
 
-    def _table(self) -> list[tuple[int, int]]:
+    def _table(self) -> list[bytes]:
+        if self.mode is not Mode.SPIKES:
+            return [_ENTRY.pack(*entry) for lit in self.sequence for entry in _entries(_steps(lit))]
         table = []
-        for lit in self.sequence:
+        for lit, windows in zip(self.sequence, self.windows, strict=True):
             steps = _steps(lit)
-            table += [(mask, exposure | _CONTINUES) for mask, exposure in steps[:-1]]
-            table.append(steps[-1])
+            steps += [(0, 0)] * (len(windows) - len(steps))
+            unused = [_NO_WINDOW] * (len(steps) - len(windows))
+            for entry, window in zip(_entries(steps), [*windows, *unused], strict=True):
+                table.append(_WINDOWED_ENTRY.pack(*entry, *window))
         return table
 
     @classmethod
@@ -326,23 +421,45 @@ class Command:
         sh_period, icg_period, mode, count = struct.unpack_from(">IIBH", data, 2)
         if mode == Mode.ORIGINAL:
             return cls(sh_period, icg_period, count)
-        version, entries = data[13], data[14]
-        if version != _STREAM.version:
+        version, entries, options = data[13], data[14], data[15]
+        if version not in (_STREAM.version, _SPIKES.version) or (
+            version == _STREAM.version and (mode == Mode.SPIKES or options)
+        ):
             raise CommandError(
-                f"extension version {version}: known is {_STREAM.version}", Refusal.VERSION
+                f"extension version {version}: known are {_STREAM.version}, without windows and "
+                f"options, and {_SPIKES.version}",
+                Refusal.VERSION,
+            )
+        if options & ~(_AWAIT_SYNC | _BRIEF):
+            raise CommandError(
+                f"options {options:#04x}: known are {_AWAIT_SYNC | _BRIEF:#04x}", Refusal.VERSION
             )
         if not 1 <= entries <= TABLE_MAX:
             raise CommandError(f"{entries} entries: allowed are 1 to {TABLE_MAX}", Refusal.TABLE)
-        end = _EXTENSION + entries * _ENTRY.size
+        start = _SPIKES.table_at if mode == Mode.SPIKES else _EXTENSION
+        entry = _WINDOWED_ENTRY if mode == Mode.SPIKES else _ENTRY
+        end = start + entries * entry.size
         if len(data) < end + 4:
             raise ShortFrame(f"{len(data)} bytes: {entries} entries need {end + 4}")
         crc = int.from_bytes(data[end : end + 4], "little")
         if crc != crc32_words(data[:end]):
             raise CommandError("the checksum differs: bytes were changed", Refusal.CHECKSUM)
-        if mode != Mode.STREAM:
-            raise CommandError(f"mode {mode}: known are 0 and {Mode.STREAM.value}", Refusal.MODE)
-        sequence = _sequence(list(_ENTRY.iter_unpack(data[_EXTENSION:end])))
-        return cls(sh_period, icg_period, count, Mode.STREAM, sequence)
+        sync = bool(options & _AWAIT_SYNC)
+        table = list(entry.iter_unpack(data[start:end]))
+        if mode == Mode.STREAM:
+            sequence = _sequence(table)
+            return cls(sh_period, icg_period, count, Mode.STREAM, sequence, await_sync=sync)
+        if mode != Mode.SPIKES:
+            raise CommandError(f"mode {mode}: known are 0, 1 and {Mode.SPIKES.value}", Refusal.MODE)
+        saturated, threshold = _LIMITS.unpack_from(data, _EXTENSION)
+        return cls(
+            *(sh_period, icg_period, count, Mode.SPIKES),
+            sequence=_sequence([found[:2] for found in table]),
+            windows=_windows(table),
+            saturated=saturated,
+            threshold=threshold,
+            await_sync=sync,
+        )
 
 
 def check_periods(sh_period: int, icg_period: int) -> None:
@@ -434,14 +551,61 @@ def _steps(lit: Mapping[int, int]) -> list[tuple[int, int]]:
     return [(masks[e], e) for e in sorted(masks, reverse=True)] or [(0, 0)]
 
 
-def _sequence(table: list[tuple[int, int]]) -> list[dict[int, int]]:
+def _entries(steps: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Mark all but the last step of a frame as followed by another one."""
+    return [(mask, exposure | _CONTINUES) for mask, exposure in steps[:-1]] + steps[-1:]
+
+
+def _checked_windows(frame: int, windows: Any) -> tuple[tuple[int, int], ...]:
+    """Check the windows of one frame; without any, the whole line."""
+    result = []
+    for window in windows:
+        try:
+            first, last = window
+        except (TypeError, ValueError):
+            raise CommandError(
+                f"windows[{frame}] = {windows!r}: pairs of first and last pixel are needed; was "
+                "one window given instead of a list of them?",
+                Refusal.TABLE,
+            ) from None
+        first = _whole(f"first pixel of windows[{frame}]", first, Refusal.TABLE)
+        last = _whole(f"last pixel of windows[{frame}]", last, Refusal.TABLE)
+        if not (first >= 0 and last < PIXELS and last - first + 1 >= WINDOW_MIN):
+            raise CommandError(
+                f"windows[{frame}]: {first} to {last}: allowed are {WINDOW_MIN} pixels or more "
+                f"within 0 to {PIXELS - 1}",
+                Refusal.TABLE,
+            )
+        result.append((first, last))
+    if len(result) > WINDOWS_MAX:
+        raise CommandError(
+            f"windows[{frame}]: {len(result)}: allowed are {WINDOWS_MAX} in one frame",
+            Refusal.TABLE,
+        )
+    return tuple(result) or (FULL_WINDOW,)
+
+
+def _windows(table: Sequence[tuple[int, ...]]) -> list[list[tuple[int, int]]]:
+    """Undo `Command._table` for the windows, refusing what the device refuses."""
+    result: list[list[tuple[int, int]]] = [[]]
+    for number, (_, word, first, last) in enumerate(table):
+        if (first, last) != _NO_WINDOW:
+            result[-1].append((first, last))
+        if not word & _CONTINUES:
+            if not result[-1]:
+                raise CommandError(f"entry {number}: a frame without a window", Refusal.TABLE)
+            result.append([])
+    return result[:-1]
+
+
+def _sequence(table: Sequence[tuple[int, ...]]) -> list[dict[int, int]]:
     """Undo `Command._table`, refusing what the device refuses."""
     result: list[dict[int, int]] = []
     lit: dict[int, int] = {}
     before: int | None = None
     for number, (mask, word) in enumerate(table):
         exposure = word & ~_CONTINUES
-        if before is not None and exposure >= before:
+        if before is not None and exposure >= before and (mask or exposure):
             raise CommandError(
                 f"entry {number}: exposure {exposure} after {before}; they must fall in a frame",
                 Refusal.TABLE,
@@ -544,15 +708,11 @@ def decode_frame(
         `ShortFrame`, `BadMagic` or `BadChecksum`: it did not arrive as it was sent.
         `BadVersion` or `BadHeader`: it did, but is not understood here.
     """
-    header = _checked_header(data)
+    header = _checked_header(data, Mode.STREAM)
     flags, sequence, leds, clocks, icg_period, sh_period = header
     timestamp = _nanoseconds(clocks, master_clock)
     if flags & _STATUS_FLAG:
-        code, _, build = _STATUS.unpack_from(data, _HEADER.size)
-        if code not in Refusal._value2member_map_:
-            raise BadHeader(f"refusal {code}: known are {[member.value for member in Refusal]}")
-        firmware = build.rstrip(b"\0").decode("ascii", "replace")
-        return Status(Refusal(code), firmware, sh_period, icg_period, timestamp, sequence, flags)
+        return _status(data, header, timestamp)
     elements = np.frombuffer(data, "<u2", ELEMENTS, _HEADER.size).astype(np.uint16)
     return Frame(
         elements,
@@ -569,31 +729,114 @@ def decode_frame(
     )
 
 
-def _checked_header(
+def decode_spikes(
     data: bytes | bytearray | memoryview,
+    *,
+    exposures: Mapping[int, int] | None = None,
+    master_clock: int = MASTER_CLOCK,
+    utc_ns: int = 0,
+    monotonic_ns: int = 0,
+) -> SpikeFrame | Status:
+    """Decode a transfer of spikes mode.
+
+    Parameters
+    ----------
+    data : bytes-like
+        256 bytes.
+    exposures, master_clock, utc_ns, monotonic_ns
+        As in `decode_frame`.
+
+    Returns
+    -------
+    SpikeFrame or Status
+
+    Raises
+    ------
+    DecodeError
+        As in `decode_frame`.
+    """
+    header = _checked_header(data, Mode.SPIKES)
+    flags, sequence, leds, clocks, icg_period, sh_period = header
+    timestamp = _nanoseconds(clocks, master_clock)
+    if flags & _STATUS_FLAG:
+        return _status(data, header, timestamp)
+    count, window_count, dark, _ = _FOUND.unpack_from(data, _HEADER.size)
+    if count > SPIKES_MAX or not 1 <= window_count <= WINDOWS_MAX:
+        raise BadHeader(
+            f"{count} spikes in {window_count} windows: allowed are {SPIKES_MAX} in 1 to "
+            f"{WINDOWS_MAX}"
+        )
+    at = _HEADER.size + _FOUND.size
+    windows = tuple(_WINDOW.unpack_from(data, at + n * _WINDOW.size) for n in range(window_count))
+    at += WINDOWS_MAX * _WINDOW.size
+    spikes = []
+    for n in range(count):
+        position, width, height, marks, window = _SPIKE.unpack_from(data, at + n * _SPIKE.size)
+        if window >= window_count:
+            raise BadHeader(f"a spike in window {window} of {window_count}")
+        position, width = position / _SPIKES.position_scale, width / _SPIKES.width_scale
+        spikes.append(OnboardSpike(position, width, height, marks, window))
+    return SpikeFrame(
+        tuple(spikes),
+        windows=windows,
+        dark_level=dark / _SPIKES.dark_scale,
+        sequence=sequence,
+        leds=leds,
+        exposures={} if exposures is None else exposures,
+        sh_period=sh_period,
+        icg_period=icg_period,
+        master_clock=master_clock,
+        timestamp=timestamp,
+        utc_ns=utc_ns,
+        monotonic_ns=monotonic_ns,
+        flags=flags,
+    )
+
+
+def _status(
+    data: bytes | bytearray | memoryview,
+    header: tuple[FrameFlags, int, int, int, int, int],
+    timestamp: int,
+) -> Status:
+    flags, sequence, _, _, icg_period, sh_period = header
+    code, _, build = _STATUS.unpack_from(data, _HEADER.size)
+    if code not in Refusal._value2member_map_:
+        raise BadHeader(f"refusal {code}: known are {[member.value for member in Refusal]}")
+    firmware = build.rstrip(b"\0").decode("ascii", "replace")
+    return Status(Refusal(code), firmware, sh_period, icg_period, timestamp, sequence, flags)
+
+
+def _checked_header(
+    data: bytes | bytearray | memoryview, mode: Mode
 ) -> tuple[FrameFlags, int, int, int, int, int]:
-    if len(data) != STREAM_SIZE:
-        raise ShortFrame(f"{len(data)} bytes: a transfer in stream mode has {STREAM_SIZE}")
+    if len(data) != SIZES[mode]:
+        raise ShortFrame(
+            f"{len(data)} bytes: a transfer in {mode.name.lower()} mode has {SIZES[mode]}"
+        )
     magic, version, flags, *rest = _HEADER.unpack_from(data)
     if magic != _STREAM.magic:
         raise BadMagic(
             f"begins with {magic:#06x}, not {_STREAM.magic:#06x}: a transfer is out of step, or "
-            "the device is not in stream mode"
+            f"the device is not in {mode.name.lower()} mode"
         )
-    sent = int.from_bytes(data[_CRC_AT:], "little")
-    found = crc32_words(memoryview(data)[:_CRC_AT])
+    sent = int.from_bytes(data[-4:], "little")
+    found = crc32_words(memoryview(data)[:-4])
     if sent != found:
         raise BadChecksum(
             f"checksum {found:#010x}, sent was {sent:#010x}: bytes were changed on the link"
         )
-    if version != _STREAM.version:
+    if version != (known := _version(mode)):
         raise BadVersion(
-            f"frame version {version}: known is {_STREAM.version}; firmware and host program "
-            "must come from the same release"
+            f"frame version {version}: known is {known}; firmware and host program must come from "
+            "the same release"
         )
     if flags & ~_KNOWN_FLAGS:
         raise BadHeader(f"flags {flags:#04x}: known are {_KNOWN_FLAGS:#04x}")
     return (FrameFlags(flags), *rest)
+
+
+def _version(mode: Mode) -> int:
+    return _SPIKES.version if mode is Mode.SPIKES else _STREAM.version
 
 
 def _nanoseconds(clocks: int, master_clock: int) -> int:
@@ -610,22 +853,44 @@ def encode_frame(frame: Frame) -> bytes:
     What belongs to the host (exposures, its clocks and flags) is not sent. A frame without a
     timestamp gets 0.
     """
+    return _sealed(Mode.STREAM, *_head(frame), encode_elements(frame))
+
+
+def encode_spikes(frame: SpikeFrame) -> bytes:
+    """Encode a frame as the device sends it in spikes mode, 256 bytes; see `encode_frame`."""
+    spikes = [
+        _SPIKE.pack(
+            round(spike.position * _SPIKES.position_scale),
+            round(spike.width * _SPIKES.width_scale),
+            *(spike.height, spike.flags, spike.window),
+        )
+        for spike in frame.spikes
+    ]
+    dark = round(frame.dark_level * _SPIKES.dark_scale)
+    windows = b"".join(_WINDOW.pack(*window) for window in frame.windows)
+    body = _FOUND.pack(len(spikes), len(frame.windows), dark, 0)
+    body += windows.ljust(WINDOWS_MAX * _WINDOW.size, b"\0") + b"".join(spikes)
+    return _sealed(Mode.SPIKES, *_head(frame), body)
+
+
+def _head(frame: Frame | SpikeFrame) -> tuple[int, tuple[int, ...]]:
     clocks = _clocks(frame.timestamp or 0, frame.master_clock)
     flags = int(frame.flags) & _KNOWN_FLAGS & ~FrameFlags.STATUS
-    head = (frame.sequence, frame.leds, clocks, frame.icg_period, frame.sh_period)
-    return _sealed(flags, head, encode_elements(frame))
+    return flags, (frame.sequence, frame.leds, clocks, frame.icg_period, frame.sh_period)
 
 
-def encode_status(status: Status, master_clock: int = MASTER_CLOCK) -> bytes:
-    """Encode an answer as the device sends it in stream mode, 7424 bytes."""
+def encode_status(
+    status: Status, master_clock: int = MASTER_CLOCK, *, mode: Mode = Mode.STREAM
+) -> bytes:
+    """Encode an answer as the device sends it in stream mode, 7424 bytes, or in spikes mode."""
     clocks = _clocks(status.timestamp, master_clock)
     flags = int(status.flags) & _KNOWN_FLAGS | FrameFlags.STATUS
     head = (status.sequence, 0, clocks, status.icg_period, status.sh_period)
     build = status.firmware.encode("ascii", "replace")
-    return _sealed(flags, head, _STATUS.pack(status.refusal, 0, build))
+    return _sealed(mode, flags, head, _STATUS.pack(status.refusal, 0, build))
 
 
-def _sealed(flags: int, head: tuple[int, ...], body: bytes) -> bytes:
-    data = _HEADER.pack(_STREAM.magic, _STREAM.version, flags, *head) + body
-    data = data.ljust(_CRC_AT, b"\0")
+def _sealed(mode: Mode, flags: int, head: tuple[int, ...], body: bytes) -> bytes:
+    data = _HEADER.pack(_STREAM.magic, _version(mode), flags, *head) + body
+    data = data.ljust(SIZES[mode] - 4, b"\0")
     return data + crc32_words(data).to_bytes(4, "little")

@@ -35,7 +35,15 @@ from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, Self
 
 import numpy as np
 
-from acquisition.frames import CHANNELS, ELEMENTS, MASTER_CLOCK, Frame, FrameFlags, stack
+from acquisition.frames import (
+    CHANNELS,
+    ELEMENTS,
+    MASTER_CLOCK,
+    Frame,
+    FrameFlags,
+    SpikeFrame,
+    stack,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
@@ -234,10 +242,14 @@ class SessionWriter:
         SessionError
             The file cannot be written, such as on a full disk; a value does not fit its column.
         """
-        if isinstance(frames, Frame):
+        if isinstance(frames, Frame | SpikeFrame):
             frames = [frames]
         if not frames:
             return
+        if not all(isinstance(frame, Frame) for frame in frames):
+            raise SessionError(
+                "a session keeps pixels, and frames of spikes mode have none: record in stream mode"
+            )
         first, last = self._count, self._count + len(frames)
         with _converted(self.path, "cannot be written"):
             arrays = stack(frames)

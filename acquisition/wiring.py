@@ -197,6 +197,25 @@ class Stream:
 
 
 @dataclass(frozen=True)
+class Spikes:
+    """Constants of spikes mode; meanings in wiring.toml."""
+
+    version: int
+    frame_size: int
+    table_at: int
+    entry_size: int
+    no_window: int
+    window_min: int
+    windows_max: int
+    spikes_max: int
+    position_scale: int
+    width_scale: int
+    dark_scale: int
+    saturated: int
+    flags: Mapping[str, int]
+
+
+@dataclass(frozen=True)
 class Protocol:
     """Constants of the link and of the sensor's timing; meanings in wiring.toml."""
 
@@ -216,7 +235,9 @@ class Protocol:
     flush_pulses: int
     spi_clock_max: int
     modes: Mapping[str, int]
+    options: Mapping[str, int]
     stream: Stream
+    spikes: Spikes
 
     @property
     def original_size(self) -> int:
@@ -310,15 +331,18 @@ def read(text: str) -> tuple[Wiring, Protocol]:
 
 
 def _protocol(data: dict[str, Any]) -> Protocol:
-    stream = dict(data["stream"])
+    stream, spikes = dict(data["stream"]), dict(data["spikes"])
     for name in ("flags", "refusals"):
         stream[name] = MappingProxyType(stream[name])
+    spikes["flags"] = MappingProxyType(spikes["flags"])
     return Protocol(
         **{
             **data,
             "command_magic": tuple(data["command_magic"]),
             "modes": MappingProxyType(data["modes"]),
+            "options": MappingProxyType(data["options"]),
             "stream": Stream(**stream),
+            "spikes": Spikes(**spikes),
         }
     )
 
@@ -375,6 +399,13 @@ def _check_constants(wiring: Wiring, protocol: Protocol) -> None:
         raise WiringError("protocol.stream.frame_size is not header, elements and checksum")
     if stream.header_size % 4 or stream.entry_size % 4:
         raise WiringError("protocol.stream: the CRC unit takes words of 4 bytes")
+    spikes = protocol.spikes
+    if spikes.frame_size % 4 or spikes.table_at % 4 or spikes.entry_size % 4:
+        raise WiringError("protocol.spikes: the CRC unit takes words of 4 bytes")
+    if spikes.version == stream.version:
+        raise WiringError(
+            "protocol.spikes.version: that of stream mode has neither windows nor options"
+        )
     if sh_edge(protocol) >= protocol.icg_pulse:
         raise WiringError("protocol: the SH pulse ends after the ICG pulse")
 
@@ -384,7 +415,7 @@ def sh_edge(protocol: Protocol) -> int:
     return protocol.sh_delay - protocol.icg_delay + protocol.sh_pulse
 
 
-def flag_checksum(protocol: Protocol, flag: int) -> int:
+def flag_checksum(frame_size: int, flag: int) -> int:
     """Tell what a header flag does to the frame's checksum.
 
     A CRC is linear: changing one bit of the frame changes the checksum by a constant. So a flag
@@ -392,7 +423,8 @@ def flag_checksum(protocol: Protocol, flag: int) -> int:
 
     Parameters
     ----------
-    protocol : Protocol
+    frame_size : int
+        Bytes of the frame, its checksum included.
     flag : int
         Bit of the header's flags.
 
@@ -402,7 +434,7 @@ def flag_checksum(protocol: Protocol, flag: int) -> int:
         To be xored to the checksum.
     """
     crc = flag << 24  # the flags are the fourth byte, the highest of the first word
-    for _ in range(8 * (protocol.stream.frame_size - 4)):
+    for _ in range(8 * (frame_size - 4)):
         crc = (crc << 1) ^ (0x104C11DB7 if crc & 0x80000000 else 0)
     return crc
 
@@ -458,11 +490,23 @@ def c_header() -> str:
         lines += _define(f"FLAG_{name.upper()}", value)
     for name, value in PROTOCOL.stream.refusals.items():
         lines += _define(f"REFUSAL_{name.upper()}", value)
+    lines += ["", "/* spikes mode, and the options of both */"]
+    for name, value in vars(PROTOCOL.spikes).items():
+        if isinstance(value, int):
+            lines += _define(f"SPIKES_{name.upper()}", value)
+    for name, value in PROTOCOL.spikes.flags.items():
+        lines += _define(f"SPIKE_{name.upper()}", value)
+    for name, value in PROTOCOL.options.items():
+        lines += _define(f"OPTION_{name.upper()}", value)
+    lines += ["", "/* what toggling a flag, by bit, does to the checksum: a CRC is linear */"]
     bits = [1 << n for n in range(max(PROTOCOL.stream.flags.values()).bit_length())]
-    checksums = ", ".join(f"{flag_checksum(PROTOCOL, bit):#010x}u" for bit in bits)
+    for mode, size in (
+        ("STREAM", PROTOCOL.stream.frame_size),
+        ("SPIKES", PROTOCOL.spikes.frame_size),
+    ):
+        checksums = ", ".join(f"{flag_checksum(size, bit):#010x}u" for bit in bits)
+        lines.append(f"#define {mode}_FLAG_CHECKSUMS {checksums}")
     lines += [
-        "/* what toggling a flag, by bit, does to the checksum: a CRC is linear */",
-        f"#define FLAG_CHECKSUMS {checksums}",
         "",
         *_ASSERTS,
         "",
@@ -478,7 +522,7 @@ _ASSERTS: Final = (
     "_Static_assert(STREAM_FRAME_SIZE == STREAM_HEADER_SIZE + ORIGINAL_SIZE + 4,",
     '               "header, elements, checksum");',
     '_Static_assert(STREAM_FRAME_SIZE % 4 == 0, "the CRC unit takes words");',
-    "_Static_assert(16 + STREAM_TABLE_MAX * STREAM_ENTRY_SIZE + 4 <= ORIGINAL_SIZE,",
+    "_Static_assert(SPIKES_TABLE_AT + STREAM_TABLE_MAX * SPIKES_ENTRY_SIZE + 4 <= ORIGINAL_SIZE,",
     '               "a command fits in a transfer");',
     '_Static_assert(SH_EDGE < STREAM_EXPOSURE_MIN, "an LED goes on before ICG\'s edge");',
     '_Static_assert(SH_EDGE < ICG_PULSE && ICG_PULSE < SH_MIN, "pulses do not overlap");',

@@ -86,6 +86,7 @@ static void pins_init(void)
     pin_alternate(SH_PORT, SH_PIN, SH_AF);
     pin_alternate(ICG_PORT, ICG_PIN, ICG_AF);
     pin_mode(OS_PORT, OS_PIN, PIN_ANALOG);
+    SYNC_PORT->PUPDR |= 2u << (2u * SYNC_PIN); /* pulled down; an input from reset on */
 }
 
 void irq_enable(enum irq irq, enum priority priority)

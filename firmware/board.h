@@ -14,7 +14,7 @@
 
 /* 0 is the most urgent. After the thesis's table 4.2, with what it does not have below. */
 enum priority {
-    PRIORITY_ICG = 0,  /* TIM5: 4 us from the edge until the ADC's timer must be armed */
+    PRIORITY_ICG = 0,  /* TIM5: 4 us from the edge until the ADC's timer must be armed; sync */
     PRIORITY_ADC = 1,  /* DMA2: a frame is complete, its checksum is */
     PRIORITY_LINK = 2, /* DMA1 and the edges of SCK */
     PRIORITY_SH = 3,   /* TIM2 */
@@ -25,6 +25,7 @@ enum priority {
 void SysTick_Handler(void);
 void DMA1_Stream3_IRQHandler(void);
 void TIM2_IRQHandler(void);
+void EXTI1_IRQHandler(void);
 void EXTI15_10_IRQHandler(void);
 void TIM5_IRQHandler(void);
 void DMA2_Stream0_IRQHandler(void);

@@ -1,6 +1,8 @@
 #include "command.h"
 
-#define TABLE_AT 16u
+#define MODE_AT 10u
+#define STREAM_TABLE_AT 16u
+#define FULL_SCALE 4095u
 
 static uint32_t big_endian(const uint8_t *bytes)
 {
@@ -15,7 +17,7 @@ static uint32_t little_endian(const uint8_t *bytes)
 }
 
 /* In software, four bits at a time: the CRC unit may be in the middle of a frame. The longest
- * command takes about 70 us. */
+ * command takes about 90 us. */
 uint32_t crc_words(const uint8_t *bytes, uint32_t words)
 {
     static const uint32_t table[16] = {
@@ -37,6 +39,11 @@ bool command_present(const uint8_t *bytes)
     return bytes[0] == COMMAND_MAGIC_0 && bytes[1] == COMMAND_MAGIC_1;
 }
 
+bool command_brief(const uint8_t *bytes)
+{
+    return command_present(bytes) && bytes[MODE_AT] == MODE_SPIKES && (bytes[15] & OPTION_BRIEF);
+}
+
 bool periods_valid(uint32_t sh_period, uint32_t icg_period)
 {
     return sh_period >= SH_MIN && icg_period >= ICG_MIN && icg_period % sh_period == 0;
@@ -48,9 +55,20 @@ struct entry {
     bool continues;
 };
 
+static uint32_t table_at(uint32_t mode)
+{
+    return mode == MODE_SPIKES ? SPIKES_TABLE_AT : STREAM_TABLE_AT;
+}
+
+static uint32_t entry_size(uint32_t mode)
+{
+    return mode == MODE_SPIKES ? SPIKES_ENTRY_SIZE : STREAM_ENTRY_SIZE;
+}
+
 static struct entry entry_read(const uint8_t *bytes, uint32_t index)
 {
-    const uint8_t *at = bytes + TABLE_AT + index * STREAM_ENTRY_SIZE;
+    const uint32_t mode = bytes[MODE_AT];
+    const uint8_t *at = bytes + table_at(mode) + index * entry_size(mode);
     const uint32_t exposure = little_endian(at + 8);
     return (struct entry){
         .leds = ((uint64_t)little_endian(at + 4) << 32) | little_endian(at),
@@ -59,13 +77,14 @@ static struct entry entry_read(const uint8_t *bytes, uint32_t index)
     };
 }
 
-/* Exposures of one frame fall, and the last frame is complete. */
+/* Exposures of one frame fall, but for those of entries that light nothing, and the last frame is
+ * complete. */
 static bool table_ordered(const uint8_t *bytes, uint32_t entries)
 {
     uint32_t before = UINT32_MAX;
     for (uint32_t n = 0; n < entries; n++) {
         const struct entry entry = entry_read(bytes, n);
-        if (entry.exposure >= before)
+        if (entry.exposure >= before && (entry.leds || entry.exposure))
             return false;
         before = entry.continues ? entry.exposure : UINT32_MAX;
     }
@@ -116,31 +135,68 @@ static bool table_read(const uint8_t *bytes, uint32_t entries, struct plan *plan
     return true;
 }
 
+/* Where spikes are looked for; each frame has a window. */
+static bool windows_read(const uint8_t *bytes, uint32_t entries, struct plan *plan)
+{
+    uint32_t windows = 0, frames = 0;
+    plan->first_window[0] = 0;
+    for (uint32_t n = 0; n < entries; n++) {
+        const uint32_t both = little_endian(bytes + SPIKES_TABLE_AT + n * SPIKES_ENTRY_SIZE + 12u);
+        const uint32_t first = both & 0xFFFFu, last = both >> 16;
+        if (first != SPIKES_NO_WINDOW || last != SPIKES_NO_WINDOW) {
+            if (last >= PIXELS || first + SPIKES_WINDOW_MIN > last + 1u)
+                return false;
+            plan->windows[windows++] =
+                (struct window){.first = (uint16_t)first, .last = (uint16_t)last};
+        }
+        if (entry_read(bytes, n).continues)
+            continue;
+        const uint32_t of_frame = windows - plan->first_window[frames];
+        if (of_frame < 1u || of_frame > SPIKES_WINDOWS_MAX)
+            return false;
+        plan->first_window[++frames] = (uint8_t)windows;
+    }
+    const uint32_t limits = little_endian(bytes + STREAM_TABLE_AT);
+    plan->saturated = (uint16_t)limits;
+    plan->threshold = (uint16_t)(limits >> 16);
+    return plan->saturated <= FULL_SCALE && plan->threshold <= FULL_SCALE;
+}
+
 uint32_t command_read(const uint8_t *bytes, struct plan *plan)
 {
     plan->sh_period = big_endian(bytes + 2);
     plan->icg_period = big_endian(bytes + 6);
-    plan->mode = bytes[10];
+    plan->mode = bytes[MODE_AT];
     plan->count = ((uint32_t)bytes[11] << 8) | bytes[12];
     plan->frames = 0;
+    plan->await_sync = false;
     plan->first_step[0] = 0;
 
     const bool periods = periods_valid(plan->sh_period, plan->icg_period);
     if (plan->mode == MODE_ORIGINAL)
         return periods ? REFUSAL_NONE : REFUSAL_PERIODS;
     const uint32_t entries = bytes[14];
-    if (bytes[13] != STREAM_VERSION)
+    const uint32_t version = bytes[13], options = bytes[15];
+    if (version != SPIKES_VERSION &&
+        (version != STREAM_VERSION || plan->mode == MODE_SPIKES || options))
         return REFUSAL_VERSION;
+    if (options & ~(OPTION_AWAIT_SYNC | OPTION_BRIEF))
+        return REFUSAL_VERSION;
+    plan->await_sync = (options & OPTION_AWAIT_SYNC) != 0;
     if (entries < 1u || entries > STREAM_TABLE_MAX)
         return REFUSAL_TABLE;
-    const uint32_t end = TABLE_AT + entries * STREAM_ENTRY_SIZE;
+    const uint32_t end = table_at(plan->mode) + entries * entry_size(plan->mode);
     if (crc_words(bytes, end / 4u) != little_endian(bytes + end))
         return REFUSAL_CHECKSUM;
-    if (plan->mode != MODE_STREAM)
+    if (plan->mode != MODE_STREAM && plan->mode != MODE_SPIKES)
         return REFUSAL_MODE;
     if (!table_ordered(bytes, entries))
         return REFUSAL_TABLE;
     if (!periods)
         return REFUSAL_PERIODS;
-    return table_read(bytes, entries, plan) ? REFUSAL_NONE : REFUSAL_TABLE;
+    if (!table_read(bytes, entries, plan))
+        return REFUSAL_TABLE;
+    if (plan->mode == MODE_SPIKES && !windows_read(bytes, entries, plan))
+        return REFUSAL_TABLE;
+    return REFUSAL_NONE;
 }

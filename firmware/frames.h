@@ -6,6 +6,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "spikes.h"
 #include "wiring.h"
 
 struct header {
@@ -30,14 +31,26 @@ struct status {
     char build[32]; /* NUL padded */
 };
 
+/* What is sent in spikes mode after the header. */
+struct brief {
+    struct found found;
+    uint8_t unused[SPIKES_FRAME_SIZE - STREAM_HEADER_SIZE - sizeof(struct found) - 4u];
+    uint32_t crc;
+};
+_Static_assert(sizeof(struct brief) == SPIKES_FRAME_SIZE - STREAM_HEADER_SIZE, "no padding");
+
 struct frame {
     struct header header;
     union {
         uint16_t elements[ELEMENTS];
         struct status status;
+        struct brief brief;
+        uint32_t brief_words[sizeof(struct brief) / 4u];
     };
     uint32_t crc;
     uint16_t spare[SPARE_ELEMENTS];
+    struct search search;
+    bool is_brief; /* laid out as in spikes mode, or will be when it has been searched */
     bool in_use;
     bool stale; /* its acquisition has been given up: not to be sent */
 };
@@ -50,7 +63,13 @@ struct frame *frame_take(void);
 void frame_release(struct frame *frame); /* not the status frame: nothing happens */
 /* Computes the checksum, by DMA in 0.2 ms at most, then calls frame_sealed. */
 void frame_seal(struct frame *frame);
-void frames_abandon(void); /* those being sealed are stale */
+uint32_t *frame_crc(struct frame *frame);
+/* Lets frames_search find the spikes of a frame, which takes their place; then it is sealed. If
+ * another one waits, that is missed. */
+void frame_search(struct frame *frame);
+bool frames_unsearched(void);
+void frames_search(void);  /* where everything else interrupts */
+void frames_abandon(void); /* those being searched or sealed are stale */
 
 void frame_sealed(struct frame *frame); /* in main.c */
 

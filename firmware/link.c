@@ -3,8 +3,8 @@
  * nothing else empties a transmit buffer that already holds a byte.
  *
  * Original framing runs on, transfer after transfer, as hosts of the original firmware expect; it
- * is begun anew when a frame is ready and no transfer under way. In stream framing every transfer
- * is armed singly. */
+ * is begun anew when a frame is ready and no transfer under way. In stream and spikes framing, which
+ * differ in length, every transfer is armed singly. */
 #include "link.h"
 
 #include "board.h"
@@ -34,7 +34,7 @@ static _Alignas(4) uint8_t received[STREAM_FRAME_SIZE];
 static _Alignas(4) uint8_t head[COMMAND_SIZE]; /* what a command would be in */
 
 /* Shared by the interrupts of the link, of frames and of SysTick; changed with interrupts off. */
-static bool stream;          /* framing */
+static uint32_t framing;      /* a MODE_ */
 static volatile bool busy;   /* a transfer has begun, or its end is being dealt with */
 static struct frame *armed;  /* is sent by the transfer that runs or comes */
 static bool offered;         /* it was, with the ready pin */
@@ -43,10 +43,20 @@ static bool status_due;      /* the status frame is to be offered next */
 static bool status_sealed;   /* its checksum is right */
 static uint8_t lost;         /* flags for the next frame: those of frames not sent, and that */
 static uint32_t left_before, rest_ticks;
+static uint32_t held;        /* spikes framing: bytes received of a transfer that is a command */
 
 static uint32_t transfer_size(void)
 {
-    return stream ? STREAM_FRAME_SIZE : ORIGINAL_SIZE;
+    static const uint16_t sizes[] = {[MODE_ORIGINAL] = ORIGINAL_SIZE,
+                                     [MODE_STREAM] = STREAM_FRAME_SIZE,
+                                     [MODE_SPIKES] = SPIKES_FRAME_SIZE};
+    return sizes[framing];
+}
+
+/* In spikes framing twice as much, around and around: a command may be longer. */
+static uint32_t receive_size(void)
+{
+    return framing == MODE_SPIKES ? 2u * SPIKES_FRAME_SIZE : transfer_size();
 }
 
 static void stop(void)
@@ -63,9 +73,10 @@ static void watch_clock(void)
 {
     busy = false;
     rest_ticks = 0;
-    left_before = transfer_size();
+    held = 0;
+    left_before = receive_size();
     EXTI->PR = SCK_LINE;
-    EXTI->IMR = SCK_LINE;
+    EXTI->IMR |= SCK_LINE;
 }
 
 static void arm(struct frame *frame, bool offer)
@@ -77,12 +88,13 @@ static void arm(struct frame *frame, bool offer)
     dma_barrier();
     RCC->APB1RSTR = RCC_APB1RSTR_SPI2RST;
     RCC->APB1RSTR = 0;
-    const uint32_t mode = stream ? DMA_CR_MINC : DMA_CR_MINC | DMA_CR_CIRC;
-    RX->NDTR = transfer_size();
-    RX->CR = mode | DMA_CR_PL_HIGH | DMA_CR_HTIE | DMA_CR_TCIE | DMA_CR_EN;
-    TX->M0AR = stream ? dma_address(frame) : dma_address(frame->elements);
+    const uint32_t around = framing == MODE_ORIGINAL ? DMA_CR_CIRC : 0;
+    const uint32_t receive = framing == MODE_STREAM ? 0 : DMA_CR_CIRC;
+    RX->NDTR = receive_size();
+    RX->CR = receive | DMA_CR_MINC | DMA_CR_PL_HIGH | DMA_CR_HTIE | DMA_CR_TCIE | DMA_CR_EN;
+    TX->M0AR = link_streams() ? dma_address(frame) : dma_address(frame->elements);
     TX->NDTR = transfer_size();
-    TX->CR = mode | DMA_CR_PL_HIGH | DMA_CR_DIR_TO_PERIPHERAL | DMA_CR_EN;
+    TX->CR = around | DMA_CR_MINC | DMA_CR_PL_HIGH | DMA_CR_DIR_TO_PERIPHERAL | DMA_CR_EN;
     SPI2->CR2 = SPI_CR2_RXDMAEN | SPI_CR2_TXDMAEN;
     SPI2->CR1 = SPI_CR1_SSM | SPI_CR1_SPE; /* slave, mode 0, always selected */
     watch_clock();
@@ -93,17 +105,17 @@ static void arm(struct frame *frame, bool offer)
 /* The interrupt of the clock's first edge may still be pending. */
 static bool transfer_begun(void)
 {
-    return busy || (EXTI->PR & SCK_LINE) || RX->NDTR != transfer_size();
+    return busy || (EXTI->PR & SCK_LINE) || RX->NDTR != receive_size();
 }
 
 /* What was lost shows in the next frame that is sent, whose checksum has been computed already. */
 static void offer_frame(struct frame *frame)
 {
-    static const uint32_t checksums[] = {FLAG_CHECKSUMS};
+    static const uint32_t checksums[][4] = {{STREAM_FLAG_CHECKSUMS}, {SPIKES_FLAG_CHECKSUMS}};
     const uint32_t added = lost & ~(uint32_t)frame->header.flags;
-    for (uint32_t n = 0; n < sizeof checksums / sizeof checksums[0]; n++)
+    for (uint32_t n = 0; n < sizeof checksums[0] / sizeof checksums[0][0]; n++)
         if (added >> n & 1u)
-            frame->crc ^= checksums[n];
+            *frame_crc(frame) ^= checksums[frame->is_brief][n];
     frame->header.flags |= lost;
     lost = 0;
     arm(frame, true);
@@ -122,7 +134,7 @@ static void enqueue(struct frame *frame)
     queued = frame;
 }
 
-/* Stream framing, no transfer under way, nothing armed. A status frame goes first. */
+/* Not in original framing; no transfer under way, nothing armed. A status frame goes first. */
 static void arm_next(void)
 {
     if (status_due && status_sealed) {
@@ -142,7 +154,7 @@ void link_frame(struct frame *frame)
     const uint32_t masked = irq_save();
     if (frame == &status_frame) {
         status_sealed = true;
-        if (stream && status_due && !transfer_begun()) {
+        if (link_streams() && status_due && !transfer_begun()) {
             arm_next();
         }
     } else if (frame->stale) {
@@ -150,11 +162,11 @@ void link_frame(struct frame *frame)
     } else if (transfer_begun() || status_due || offered) {
         /* What is offered stays so: its transfer may begin while another frame is armed. */
         enqueue(frame);
-        if (!stream && offered && !transfer_begun()) {
+        if (!link_streams() && offered && !transfer_begun()) {
             pin_low(READY_PORT, READY_PIN); /* hosts of the published firmware wait for an edge */
             pin_high(READY_PORT, READY_PIN);
         }
-    } else if (stream) {
+    } else if (link_streams()) {
         offer_frame(frame);
     } else {
         frame_release(armed);
@@ -170,11 +182,13 @@ void link_status(uint32_t refusal)
     const uint32_t masked = irq_save();
     status_frame.header = (struct header){
         .magic = STREAM_MAGIC,
-        .version = STREAM_VERSION,
+        .version = framing == MODE_SPIKES ? SPIKES_VERSION : STREAM_VERSION,
         .flags = FLAG_STATUS,
         .icg_period = icg_period,
         .sh_period = sh_period,
     };
+    status_frame.is_brief = framing == MODE_SPIKES;
+    status_frame.brief.crc = 0;
     status_frame.status.refusal = refusal;
     status_frame.status.reserved = 0;
     for (uint32_t n = 0; n < sizeof build_id; n++)
@@ -185,15 +199,15 @@ void link_status(uint32_t refusal)
     frame_seal(&status_frame);
 }
 
-void link_framing(bool streams)
+void link_framing(uint32_t mode)
 {
     const uint32_t masked = irq_save();
-    if (stream != streams) {
+    if (framing != mode) {
         pin_low(READY_PORT, READY_PIN);
         link_abandon();
         status_due = false;
         stop();
-        if (stream) {
+        if (mode == MODE_ORIGINAL) {
             armed = frame_take(); /* whatever it holds: nothing has been read out yet */
         } else {
             frame_release(armed);
@@ -201,8 +215,8 @@ void link_framing(bool streams)
             busy = true; /* until armed anew */
         }
         offered = false;
-        stream = streams;
-        if (!stream)
+        framing = mode;
+        if (mode == MODE_ORIGINAL)
             arm(armed, false);
     }
     irq_restore(masked);
@@ -210,7 +224,7 @@ void link_framing(bool streams)
 
 bool link_streams(void)
 {
-    return stream;
+    return framing != MODE_ORIGINAL;
 }
 
 void link_abandon(void)
@@ -227,9 +241,8 @@ void link_abandon(void)
 /* A transfer is through; `head` has its beginning. */
 static void complete(void)
 {
-    const bool was_stream = stream;
     uint32_t masked = irq_save();
-    if (was_stream) {
+    if (link_streams()) {
         busy = true; /* until armed anew */
         pin_low(READY_PORT, READY_PIN);
         frame_release(armed);
@@ -245,7 +258,7 @@ static void complete(void)
         command_received(head);
 
     masked = irq_save();
-    if (stream) {
+    if (link_streams()) {
         arm_next();
     } else if (queued && !transfer_begun()) {
         frame_release(armed);
@@ -255,18 +268,42 @@ static void complete(void)
     irq_restore(masked);
 }
 
+static void keep_head(const uint8_t *bytes, uint32_t at, uint32_t size)
+{
+    const uint32_t *from = (const uint32_t *)(const void *)bytes;
+    uint32_t *to = (uint32_t *)(void *)head;
+    for (uint32_t n = 0; n < size / 4u && at / 4u + n < sizeof head / 4u; n++)
+        to[at / 4u + n] = from[n];
+}
+
+/* Spikes framing. A host that does not know of it sends a command in a transfer of original length,
+ * which is obeyed when the clock rests. */
+static void block_received(const uint8_t *bytes)
+{
+    keep_head(bytes, held, SPIKES_FRAME_SIZE);
+    if (!held && (!command_present(head) || command_brief(head))) {
+        complete();
+        return;
+    }
+    const uint32_t masked = irq_save();
+    held += SPIKES_FRAME_SIZE;
+    irq_restore(masked);
+}
+
 void DMA1_Stream3_IRQHandler(void)
 {
     const uint32_t flags = DMA1->LISR & RX_FLAGS(DMA_ISR_HTIF | DMA_ISR_TCIF);
     DMA1->LIFCR = flags;
     dma_barrier();
-    if (flags & RX_FLAGS(DMA_ISR_HTIF)) {
-        /* Copied by half-time, as the next transfer may follow at once and overwrite it. */
-        const uint32_t *from = (const uint32_t *)(const void *)received;
-        uint32_t *to = (uint32_t *)(void *)head;
-        for (uint32_t n = 0; n < sizeof head / 4u; n++)
-            to[n] = from[n];
+    if (framing == MODE_SPIKES) {
+        if (flags & RX_FLAGS(DMA_ISR_HTIF))
+            block_received(received);
+        if ((flags & RX_FLAGS(DMA_ISR_TCIF)) && held)
+            block_received(received + SPIKES_FRAME_SIZE);
+        return;
     }
+    if (flags & RX_FLAGS(DMA_ISR_HTIF)) /* by half-time: the next transfer may overwrite it */
+        keep_head(received, 0, sizeof head);
     if (flags & RX_FLAGS(DMA_ISR_TCIF))
         complete();
 }
@@ -276,7 +313,7 @@ void EXTI15_10_IRQHandler(void)
 {
     const uint32_t masked = irq_save();
     if (EXTI->PR & SCK_LINE) {
-        EXTI->IMR = 0;
+        EXTI->IMR &= ~SCK_LINE;
         EXTI->PR = SCK_LINE;
         busy = true;
         pin_low(READY_PORT, READY_PIN);
@@ -293,7 +330,7 @@ static bool stalled(uint32_t *missing)
         rest_ticks = 0;
         return false;
     }
-    if (++rest_ticks < (stream ? STALL_TICKS : ORIGINAL_STALL_TICKS))
+    if (++rest_ticks < (link_streams() ? STALL_TICKS : ORIGINAL_STALL_TICKS))
         return false;
     stop();
     busy = true; /* until armed anew */
@@ -310,12 +347,13 @@ void link_tick(void)
     if (!gave_up)
         return;
     /* A host that does not know of stream framing sends a command of original length. */
-    if (stream && STREAM_FRAME_SIZE - missing >= ORIGINAL_SIZE && command_present(head)) {
+    if (held || (framing == MODE_STREAM && STREAM_FRAME_SIZE - missing >= ORIGINAL_SIZE &&
+                 command_present(head))) {
         complete();
         return;
     }
     masked = irq_save();
-    if (!stream) {
+    if (!link_streams()) {
         if (queued) {
             frame_release(armed);
             armed = queued;
@@ -345,7 +383,7 @@ void link_init(void)
     RX->M0AR = dma_address(received);
     TX->PAR = dma_address(&SPI2->DR);
     SYSCFG->EXTICR4 = 1u << SYSCFG_EXTICR4_EXTI13; /* port B */
-    EXTI->RTSR = SCK_LINE;
+    EXTI->RTSR |= SCK_LINE;
     arm(frame_take(), false);
     irq_enable(IRQ_DMA1_STREAM3, PRIORITY_LINK);
     irq_enable(IRQ_EXTI15_10, PRIORITY_LINK);

@@ -9,9 +9,9 @@ extern const char build_id[32];
 
 void link_init(void);
 void link_frame(struct frame *frame); /* is complete, and the link's from here on */
-void link_status(uint32_t refusal);   /* answer to a command; stream framing only */
-void link_framing(bool stream);       /* of the next transfer */
-bool link_streams(void);
+void link_status(uint32_t refusal);   /* answer to a command; not in original framing */
+void link_framing(uint32_t mode);     /* of the next transfer */
+bool link_streams(void);              /* framing is not original */
 void link_abandon(void);     /* no frame of before is offered any more */
     /* original mode: the offer ends with the period */
 void link_tick(void);        /* every TICK_US */

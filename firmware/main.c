@@ -9,7 +9,7 @@ static void original_command(struct plan *plan, uint32_t refusal)
 {
     if (link_streams())
         sensor_halt();
-    link_framing(false);
+    link_framing(MODE_ORIGINAL);
     if (plan->count == 0)
         return;
     if (refusal)
@@ -27,7 +27,7 @@ static void stream_command(struct plan *plan, uint32_t refusal)
         return;
     if (refusal)
         sensor_halt(); /* original framing's frames do not fit in */
-    link_framing(true);
+    link_framing(plan->mode == MODE_SPIKES ? MODE_SPIKES : MODE_STREAM);
     if (!refusal)
         sensor_acquire(plan);
     link_status(refusal);
@@ -61,6 +61,12 @@ int main(void)
     frames_init();
     sensor_init();
     link_init();
-    for (;;)
-        __asm__ volatile("wfi"); /* all work is done by interrupts */
+    /* All work but one is done by interrupts. One that comes between the question and wfi ends it. */
+    for (;;) {
+        const uint32_t masked = irq_save();
+        if (!frames_unsearched())
+            __asm__ volatile("wfi");
+        irq_restore(masked);
+        frames_search();
+    }
 }

@@ -39,6 +39,7 @@ _Static_assert(ADC_TRIGGER > 0 && ADC_TRIGGER < ELEMENT_CYCLES, "in TIM4's perio
 #define RESYNCED 24u
 _Static_assert(RESYNCED > ADC_START_CLOCK && RESYNCED < SH_MIN, "between two triggers");
 
+#define SYNC_LINE (1u << SYNC_PIN)
 #define ADC_STREAM (&DMA2->stream[0]) /* channel 0: ADC1 */
 #define TIM4_FROM_TIM2 TIM_SMCR_TS_ITR1
 
@@ -47,11 +48,12 @@ _Static_assert(RESYNCED > ADC_START_CLOCK && RESYNCED < SH_MIN, "between two tri
 #define LEAD_EDGES 2u   /* after the flush: the second begins the first exposure */
 #define LIT_SH_PULSES 5u /* original mode: LEDs go on so many SH edges before the read-out */
 
-enum phase { IDLE, FLUSH, LEAD, READ };
+enum phase { IDLE, AWAIT, FLUSH, LEAD, READ };
 
 struct readout {
     uint64_t leds;
     uint64_t timestamp;
+    struct search search; /* spikes mode */
     uint8_t flags;
 };
 
@@ -101,6 +103,15 @@ static void clocks_init(void)
     TIM5->CCER = TIM_CCER_CC1E;
 }
 
+static void clocks_halt(void)
+{
+    TIM2->CR1 = TIM_CR1_URS;
+    TIM5->CR1 = TIM_CR1_URS;
+    stop_tick = SYSTICK->VAL;
+    /* its interrupt may not have come any more; no branch, for two that should take equally long */
+    edge_time += (TIM5->SR & TIM_SR_UIF) * icg_period + TIM5->CNT;
+}
+
 /* Between pulses, and so that SH's edges keep their distance over the start that follows. */
 static void clocks_stop(void)
 {
@@ -112,12 +123,7 @@ static void clocks_stop(void)
         icg = TIM5->CNT;
         sh = TIM2->CNT;
     } while (icg < ICG_PULSE || icg >= icg_period - 1u || sh < sh_first || sh >= sh_period - 1u);
-    TIM2->CR1 = TIM_CR1_URS;
-    TIM5->CR1 = TIM_CR1_URS;
-    stop_tick = SYSTICK->VAL;
-    if (TIM5->SR & TIM_SR_UIF)
-        edge_time += icg_period; /* its interrupt did not come any more */
-    edge_time += icg;
+    clocks_halt();
 }
 
 static void timer_prepare(struct tim *timer, uint32_t period, uint32_t delay)
@@ -129,7 +135,8 @@ static void timer_prepare(struct tim *timer, uint32_t period, uint32_t delay)
     timer->CNT = period - delay;
 }
 
-static void clocks_start(uint32_t icg, uint32_t sh)
+/* Without pulses, they only keep the time. */
+static void clocks_start(uint32_t icg, uint32_t sh, bool pulses)
 {
     icg_period = icg;
     sh_period = sh;
@@ -138,8 +145,8 @@ static void clocks_start(uint32_t icg, uint32_t sh)
     TIM2->CCR2 = 0;
     timer_prepare(TIM5, icg, ICG_DELAY);
     timer_prepare(TIM2, sh, SH_DELAY);
-    TIM5->CCR1 = ICG_PULSE;
-    TIM2->CCR2 = SH_PULSE;
+    TIM5->CCR1 = pulses ? ICG_PULSE : 0;
+    TIM2->CCR2 = pulses ? SH_PULSE : 0;
     TIM5->DIER = TIM_DIER_UIE;
     TIM2->DIER = 0;
     TIM5->SR = 0;
@@ -242,13 +249,14 @@ static void deliver(struct frame *frame, const struct readout *readout, uint32_t
         sensor_queue_frame();
         return;
     }
+    const bool spikes = plan->mode == MODE_SPIKES;
     uint8_t flags = readout->flags;
     if (refusal_due)
         flags |= FLAG_REFUSED;
     refusal_due = false;
     frame->header = (struct header){
         .magic = STREAM_MAGIC,
-        .version = STREAM_VERSION,
+        .version = spikes ? SPIKES_VERSION : STREAM_VERSION,
         .flags = flags,
         .sequence = sequence,
         .leds = readout->leds,
@@ -256,7 +264,14 @@ static void deliver(struct frame *frame, const struct readout *readout, uint32_t
         .icg_period = icg_period,
         .sh_period = sh_period,
     };
-    frame_seal(frame);
+    frame->is_brief = spikes;
+    if (!spikes) {
+        frame_seal(frame);
+        return;
+    }
+    frame->search = readout->search;
+    frame_search(frame);
+    sensor_queue_frame();
 }
 
 /* A read-out is complete. */
@@ -289,6 +304,18 @@ void DMA2_Stream0_IRQHandler(void)
 
 /* --- read-outs --------------------------------------------------------------------------------- */
 
+/* What to look for in the next read-out. */
+static void plan_search(void)
+{
+    struct search *search = &exposed.search;
+    const uint32_t first = plan->first_window[table_index];
+    search->saturated = plan->saturated;
+    search->threshold = plan->threshold;
+    search->count = (uint8_t)(plan->first_window[table_index + 1u] - first);
+    for (uint32_t n = 0; n < search->count; n++)
+        search->windows[n] = plan->windows[first + n];
+}
+
 /* An exposure begins, which the next ICG edge reads out. */
 static void expose(void)
 {
@@ -300,7 +327,9 @@ static void expose(void)
         table_index = 0;
         exposed.flags = FLAG_CHANGED;
     }
-    if (plan->mode == MODE_STREAM) {
+    if (plan->mode != MODE_ORIGINAL) {
+        if (plan->mode == MODE_SPIKES)
+            plan_search();
         exposed.leds = lights_plan(plan, table_index);
         table_index = table_index + 1u < plan->frames ? table_index + 1u : 0;
     } else if (remaining <= 2u) {
@@ -325,7 +354,7 @@ static void begin(void)
     clocks_stop();
     phase = LEAD;
     edges = 0;
-    clocks_start(next_plan->icg_period, next_plan->sh_period);
+    clocks_start(next_plan->icg_period, next_plan->sh_period, true);
 }
 
 static void icg_edge(void)
@@ -334,7 +363,7 @@ static void icg_edge(void)
         if (ADC1->SR & ADC_SR_OVR)
             adc_recover();
         adc_arm(); /* the one thing that cannot wait */
-        if (plan->mode == MODE_STREAM && exposed.leds)
+        if (plan->mode != MODE_ORIGINAL && exposed.leds)
             while (TIM5->CNT < SH_EDGE - 2u) { /* what it takes comes on top; later, it would light the next frame */
             }
     }
@@ -357,6 +386,7 @@ static void icg_edge(void)
     case READ:
         read_out();
         break;
+    case AWAIT:
     case IDLE:
         break;
     }
@@ -407,12 +437,35 @@ static void flush(void)
 {
     phase = FLUSH;
     edges = 0;
-    clocks_stop();
-    clocks_start(FLUSH_ICG, FLUSH_SH);
+    clocks_start(FLUSH_ICG, FLUSH_SH, true);
+}
+
+/* Until a rising edge on the sync line: no pulses, so that the clocks can be stopped at any time. */
+static void await_sync(void)
+{
+    phase = AWAIT;
+    clocks_start(FLUSH_ICG, FLUSH_SH, false);
+    EXTI->PR = SYNC_LINE;
+    EXTI->IMR |= SYNC_LINE;
+}
+
+/* From the edge to the timers' start there is nothing that takes longer one time than another, but
+ * for an interrupt of the same priority. The timers start with fM, whose phase differs from board to
+ * board: up to a clock. To stay together, real boards also need one clock: HSI differs by 1 %, which
+ * is 37 us in a read-out. */
+void EXTI1_IRQHandler(void)
+{
+    EXTI->PR = SYNC_LINE;
+    EXTI->IMR &= ~SYNC_LINE;
+    if (phase == AWAIT) {
+        clocks_halt();
+        flush();
+    }
 }
 
 static void give_up(void)
 {
+    EXTI->IMR &= ~SYNC_LINE;
     adc_stop();
     lights_off();
     lights_none();
@@ -440,8 +493,13 @@ void sensor_acquire(struct plan *new_plan)
     }
     adc_prepare();
     next_plan = new_plan;
-    if (phase != FLUSH) /* else it goes on, for the newest plan */
-        flush();
+    if (phase != FLUSH || new_plan->await_sync) { /* else it goes on, for the newest plan */
+        clocks_stop();
+        if (new_plan->await_sync)
+            await_sync();
+        else
+            flush();
+    }
     irq_restore(masked);
 }
 
@@ -449,7 +507,8 @@ bool sensor_exchange(struct plan *new_plan)
 {
     const uint32_t masked = irq_save();
     const struct plan *last = next_plan ? next_plan : plan;
-    const bool possible = last->mode == MODE_STREAM && (phase == LEAD || phase == READ) &&
+    const bool possible = last->mode == new_plan->mode && !new_plan->await_sync &&
+                          (phase == LEAD || phase == READ) &&
                           new_plan->sh_period == sh_period && new_plan->icg_period == icg_period;
     if (possible)
         next_plan = new_plan;
@@ -461,9 +520,9 @@ void sensor_halt(void)
 {
     const uint32_t masked = irq_save();
     give_up();
-    if (phase == FLUSH) {
+    if (phase == FLUSH || phase == AWAIT) {
         clocks_stop();
-        clocks_start(good_icg, good_sh);
+        clocks_start(good_icg, good_sh, true);
     }
     phase = IDLE;
     irq_restore(masked);
@@ -473,7 +532,7 @@ bool sensor_streams(void)
 {
     const uint32_t masked = irq_save();
     const struct plan *last = next_plan ? next_plan : plan;
-    const bool streams = phase != IDLE && last->mode == MODE_STREAM;
+    const bool streams = phase > AWAIT && last->mode != MODE_ORIGINAL;
     irq_restore(masked);
     return streams;
 }
@@ -494,7 +553,10 @@ void sensor_init(void)
     clocks_init();
     adc_init();
     stop_tick = TICK_CYCLES - 1u; /* time 0 is when SysTick started */
-    clocks_start(good_icg, good_sh);
+    clocks_start(good_icg, good_sh, true);
+    SYSCFG->EXTICR1 = 1u << SYSCFG_EXTICR1_EXTI1; /* port B */
+    EXTI->RTSR |= SYNC_LINE;
+    irq_enable(IRQ_EXTI1, PRIORITY_ICG);
     irq_enable(IRQ_DMA2_STREAM0, PRIORITY_ADC);
     irq_enable(IRQ_TIM2, PRIORITY_SH);
     irq_enable(IRQ_TIM5, PRIORITY_ICG);

@@ -7,13 +7,14 @@
 
 void sensor_init(void);
 struct plan *sensor_spare_plan(void); /* for the next command; in no other use */
-/* Flushes the sensor, then takes the plan's read-outs. Whatever went on before is given up. */
+/* Flushes the sensor, then takes the plan's read-outs; with await_sync, at the next edge on that
+ * line, so that all that see it read out together. Whatever went on before is given up. */
 void sensor_acquire(struct plan *plan);
 /* Takes over the plan's table and count without interrupting the stream that runs. Returns false
- * if none runs, or one with other periods. */
+ * if none runs, or one with other periods or in another mode, or if the plan awaits an edge. */
 bool sensor_exchange(struct plan *plan);
 void sensor_halt(void);
-bool sensor_streams(void); /* or will, after the flush */
+bool sensor_streams(void); /* not in original mode; or will, after the flush */
 void sensor_mark_refusal(void); /* in the next frame's header */
 void sensor_periods(uint32_t *sh_period, uint32_t *icg_period); /* the last good ones */
 void sensor_queue_frame(void); /* a frame may have become free */

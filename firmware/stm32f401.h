@@ -64,6 +64,7 @@ struct syscfg {
     reg EXTICR1, EXTICR2, EXTICR3, EXTICR4;     /* 0x08 */
 };
 #define SYSCFG ((struct syscfg *)0x40013800u)
+#define SYSCFG_EXTICR1_EXTI1 4u /* position */
 #define SYSCFG_EXTICR4_EXTI13 4u /* position */
 
 struct exti {
@@ -200,6 +201,7 @@ struct systick {
 #define PRIORITY_SHIFT 4u     /* of 8 bits, the upper four are implemented */
 
 enum irq {
+    IRQ_EXTI1 = 7,
     IRQ_DMA1_STREAM3 = 14,
     IRQ_TIM2 = 28,
     IRQ_EXTI15_10 = 40,

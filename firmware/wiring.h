@@ -31,6 +31,8 @@
 #define MOSI_AF 5u /* SPI2_MOSI */
 #define READY_PORT GPIOB
 #define READY_PIN 2u
+#define SYNC_PORT GPIOB
+#define SYNC_PIN 1u
 #define HEARTBEAT_PORT GPIOA
 #define HEARTBEAT_PIN 5u
 #define LED0_PORT GPIOC
@@ -112,8 +114,30 @@
 #define REFUSAL_PERIODS 3u
 #define REFUSAL_TABLE 4u
 #define REFUSAL_MODE 5u
+
+/* spikes mode, and the options of both */
+#define SPIKES_VERSION 2u
+#define SPIKES_FRAME_SIZE 256u
+#define SPIKES_TABLE_AT 20u
+#define SPIKES_ENTRY_SIZE 16u
+#define SPIKES_NO_WINDOW 65535u
+#define SPIKES_WINDOW_MIN 16u
+#define SPIKES_WINDOWS_MAX 8u
+#define SPIKES_SPIKES_MAX 8u
+#define SPIKES_POSITION_SCALE 1024u
+#define SPIKES_WIDTH_SCALE 16u
+#define SPIKES_DARK_SCALE 16u
+#define SPIKES_SATURATED 1900u
+#define SPIKE_SATURATED 1u
+#define SPIKE_CLIPPED 2u
+#define SPIKE_DOUBLE 4u
+#define SPIKE_REFLECTION 8u
+#define OPTION_AWAIT_SYNC 1u
+#define OPTION_BRIEF 2u
+
 /* what toggling a flag, by bit, does to the checksum: a CRC is linear */
-#define FLAG_CHECKSUMS 0x6b271c72u, 0xd64e38e4u, 0xa85d6c7fu, 0x547bc549u
+#define STREAM_FLAG_CHECKSUMS 0x6b271c72u, 0xd64e38e4u, 0xa85d6c7fu, 0x547bc549u
+#define SPIKES_FLAG_CHECKSUMS 0x83ecb1e4u, 0x03187e7fu, 0x0630fcfeu, 0x0c61f9fcu
 
 _Static_assert(CLOCK_HZ % MASTER_CLOCK_HZ == 0, "whole clocks");
 _Static_assert(ICG_MIN == ELEMENTS * CLOCKS_PER_ELEMENT, "one read-out");
@@ -121,7 +145,7 @@ _Static_assert(ORIGINAL_SIZE == 2 * ELEMENTS, "elements have two bytes");
 _Static_assert(STREAM_FRAME_SIZE == STREAM_HEADER_SIZE + ORIGINAL_SIZE + 4,
                "header, elements, checksum");
 _Static_assert(STREAM_FRAME_SIZE % 4 == 0, "the CRC unit takes words");
-_Static_assert(16 + STREAM_TABLE_MAX * STREAM_ENTRY_SIZE + 4 <= ORIGINAL_SIZE,
+_Static_assert(SPIKES_TABLE_AT + STREAM_TABLE_MAX * SPIKES_ENTRY_SIZE + 4 <= ORIGINAL_SIZE,
                "a command fits in a transfer");
 _Static_assert(SH_EDGE < STREAM_EXPOSURE_MIN, "an LED goes on before ICG's edge");
 _Static_assert(SH_EDGE < ICG_PULSE && ICG_PULSE < SH_MIN, "pulses do not overlap");

@@ -7,15 +7,21 @@ when is what the protocol says, stalls and all. `FaultyWire` breaks what passes 
 from __future__ import annotations
 
 import random
-from dataclasses import replace
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from acquisition.frames import ELEMENTS, MASTER_CLOCK, Frame, FrameFlags
+from acquisition.frames import (
+    ELEMENTS,
+    MASTER_CLOCK,
+    Frame,
+    FrameFlags,
+    OnboardSpike,
+    SpikeFrame,
+)
 from acquisition.protocol import (
     ORIGINAL_SIZE,
-    STREAM_SIZE,
+    SIZES,
     BadMagic,
     Command,
     CommandError,
@@ -24,6 +30,7 @@ from acquisition.protocol import (
     Status,
     encode_elements,
     encode_frame,
+    encode_spikes,
     encode_status,
 )
 
@@ -34,7 +41,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 BYTE = 8 / 15.6e6  # s
-STALL = {Mode.ORIGINAL: 50e-3, Mode.STREAM: 1e-3}  # s
+STALL = {Mode.ORIGINAL: 50e-3, Mode.STREAM: 1e-3, Mode.SPIKES: 1e-3}  # s
 FLUSH = 3 * 15000 / MASTER_CLOCK  # s
 _PATTERN = (3900 + np.random.default_rng(1304).integers(-3, 4, ELEMENTS)).astype(np.uint16)
 
@@ -45,6 +52,12 @@ def elements_at(number: int) -> NDArray[np.uint16]:
     at = 100 + 37 * (number % 90)
     result[at : at + 20] -= np.uint16(500 + number % 977)
     return result
+
+
+def spikes_at(number: int) -> tuple[OnboardSpike, ...]:
+    """What the fake firmware finds there: one spike, or two."""
+    first = OnboardSpike(100 + 37 * (number % 90) + 10.5, 20.0, 500 + number % 977, 0, 0)
+    return (first, first._replace(position=3600.25, height=99))[: 1 + number % 2]
 
 
 class FakeMcu:
@@ -128,7 +141,7 @@ class FakeMcu:
 
     @property
     def size(self) -> int:
-        return STREAM_SIZE if self.mode is Mode.STREAM else ORIGINAL_SIZE
+        return SIZES[self.mode]
 
     def exchange(self, tx: bytes) -> bytes:
         """Clock bytes through the slave, however many."""
@@ -139,14 +152,23 @@ class FakeMcu:
                 self.sending = self._to_send()
                 self.received.clear()
             at = len(self.received)
-            piece = tx[len(rx) : len(rx) + self.size - at]
-            rx += self.sending[at : at + len(piece)]
+            room = self.size - at if at < self.size else len(tx)
+            piece = tx[len(rx) : len(rx) + room]
+            rx += self.sending[at : at + len(piece)].ljust(len(piece), b"\0")
             self.received += piece
             self.last_byte = self.now + len(piece) * BYTE
             self._advance(self.last_byte)
-            if len(self.received) >= self.size:
+            if len(self.received) >= self.size and not self._held:
                 self._finished()
         return rx
+
+    @property
+    def _held(self) -> bool:
+        """In spikes mode a command ends when the clock rests, unless it says that it is short."""
+        received = self.received
+        if self.mode is not Mode.SPIKES or len(received) < self.size or received[:2] != b"ER":
+            return False
+        return not (received[10] == Mode.SPIKES and received[15] & 2)
 
     def _to_send(self) -> bytes:
         self.current, self.offered = self.offered, None
@@ -167,10 +189,11 @@ class FakeMcu:
     def _advance(self, now: float) -> None:
         self.now = max(self.now, now)
         if self.sending is not None and self.now >= self.last_byte + STALL[self.mode]:
+            held = self._held
             received, self.sending = bytes(self.received), None
-            if len(received) >= ORIGINAL_SIZE and received[:2] == b"ER":
+            if held or (len(received) >= ORIGINAL_SIZE and received[:2] == b"ER"):
                 self._act(received)
-            elif self.offered is None and self.mode is Mode.STREAM:
+            elif self.offered is None and self.mode is not Mode.ORIGINAL:
                 self.offered = self.current
         if self.now >= self.offered_until:
             self.offered, self.offered_until = None, float("inf")
@@ -183,22 +206,22 @@ class FakeMcu:
         command = self.command
         assert command is not None
         self.lit[self.read_outs] = dict(command.leds(self.sequence - self.table_at))
-        frame = Frame(
-            elements_at(self.read_outs),
-            sequence=self.sequence,
-            sh_period=command.sh_period,
-            icg_period=command.icg_period,
-            timestamp=self.read_outs * 1000,  # so that a test can tell which one it is
-            leds=sum(1 << n for n in command.leds(self.sequence - self.table_at)),
-            flags=self.flags,
-        )
+        about: dict[str, Any] = {
+            "sequence": self.sequence,
+            "sh_period": command.sh_period,
+            "icg_period": command.icg_period,
+            "timestamp": self.read_outs * 1000,  # so that a test can tell which one it is
+            "leds": sum(1 << n for n in command.leds(self.sequence - self.table_at)),
+            "flags": self.flags,
+        }
+        number = self.read_outs
         self.read_outs += 1
         self.sequence += 1
         self.left -= 1
         period = command.icg_period / MASTER_CLOCK
         self.next_at = self.next_at + period if self.left > 0 else float("inf")
         if self.mode is Mode.ORIGINAL:
-            self.buffer = encode_elements(frame)
+            self.buffer = encode_elements(Frame(elements_at(number), **about))
             self.offered = self.buffer
             if self.extra:  # the published firmware's handshake is a pulse
                 self.offered_until = self.now + period
@@ -206,10 +229,14 @@ class FakeMcu:
         if self.offered is not None:
             # the newest wins; what is lost with the older one must not be forgotten
             lost = FrameFlags(self.offered[3]) & (FrameFlags.CHANGED | FrameFlags.REFUSED)
-            kept = frame.flags | FrameFlags.DROPPED | lost
-            frame = replace(frame, flags=kept)
+            about["flags"] = self.flags | FrameFlags.DROPPED | lost
         self.flags = FrameFlags.NONE
-        self.offered = encode_frame(frame)
+        if self.mode is Mode.STREAM:
+            self.offered = encode_frame(Frame(elements_at(number), **about))
+            return
+        sequence = self.sequence - 1 - self.table_at
+        windows = tuple(command.windows[sequence % len(command.windows)])
+        self.offered = encode_spikes(SpikeFrame(spikes_at(number), windows, 3900.5, **about))
 
     # --- commands
 
@@ -230,11 +257,11 @@ class FakeMcu:
     def _refuse(self, mode: int, refusal: Refusal) -> None:
         if mode == Mode.ORIGINAL:
             return
-        if self.mode is Mode.STREAM and self.left > 0:
+        if self.mode is not Mode.ORIGINAL and self.left > 0:
             self.flags |= FrameFlags.REFUSED
             return
         self._stop()
-        self.mode = Mode.STREAM
+        self.mode = Mode.SPIKES if mode == Mode.SPIKES else Mode.STREAM
         self.offered = self._answer(refusal)
 
     def _stop(self) -> None:
@@ -243,7 +270,7 @@ class FakeMcu:
 
     def _start(self, command: Command) -> None:
         before, self.command = self.command, command
-        streaming = self.mode is Mode.STREAM and self.left > 0
+        streaming = self.mode is command.mode and self.left > 0
         self.left = command.count or float("inf")
         self.flags |= FrameFlags.CHANGED
         if command.mode is Mode.ORIGINAL:
@@ -253,18 +280,19 @@ class FakeMcu:
             self.flags = FrameFlags.NONE
             self.next_at = self.now + FLUSH + 3 * command.icg_period / MASTER_CLOCK
             return
-        if streaming and before is not None and _periods(before) == _periods(command):
+        same = before is not None and _periods(before) == _periods(command)
+        if streaming and same and not command.await_sync:
             self.table_at = self.sequence
             return
         self._stop()
         self.left = command.count or float("inf")
-        self.mode, self.sequence, self.table_at = Mode.STREAM, 0, 0
+        self.mode, self.sequence, self.table_at = command.mode, 0, 0
         self.next_at = self.now + 2 * command.icg_period / MASTER_CLOCK
         self.offered = self._answer(Refusal.NONE)
 
     def _answer(self, refusal: Refusal) -> bytes:
         sh, icg = (100, 30000) if self.command is None else _periods(self.command)
-        return encode_status(Status(refusal, "fake 1.0", sh, icg))
+        return encode_status(Status(refusal, "fake 1.0", sh, icg), mode=self.mode)
 
 
 def _periods(command: Command) -> tuple[int, int]:

@@ -340,7 +340,7 @@ def test_no_exposure_is_made_up(seed: int) -> None:
 def test_change_is_for_streams_alone() -> None:
     with pytest.raises(ValueError, match="use stream mode"):
         Capture(FakeMcu(), original()).send([{0: 10}])
-    with pytest.raises(ValueError, match="new capture"):
+    with pytest.raises(ValueError, match="original mode; begin a new one"):
         Capture(FakeMcu(), stream()).send(original())
 
 

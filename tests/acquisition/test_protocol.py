@@ -11,7 +11,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from acquisition.frames import CHANNELS, ELEMENTS, Frame, FrameFlags
+from acquisition.frames import (
+    CHANNELS,
+    ELEMENTS,
+    PIXELS,
+    Frame,
+    FrameFlags,
+    OnboardSpike,
+    SpikeFrame,
+)
 from acquisition.protocol import (
     CHAIN_FIRST,
     CHAIN_STEP,
@@ -19,6 +27,7 @@ from acquisition.protocol import (
     ICG_MIN,
     ORIGINAL_SIZE,
     SH_MIN,
+    SPIKES_SIZE,
     STREAM_SIZE,
     TABLE_MAX,
     BadChecksum,
@@ -35,8 +44,10 @@ from acquisition.protocol import (
     crc32_words,
     decode_elements,
     decode_frame,
+    decode_spikes,
     encode_elements,
     encode_frame,
+    encode_spikes,
     encode_status,
 )
 
@@ -117,7 +128,19 @@ def commands(draw: st.DrawFn) -> Command:
     if draw(st.booleans()):
         return Command(sh, icg, draw(st.integers(1, 65535)))
     sequence = draw(st.lists(exposures(sh), max_size=4))
-    return Command(sh, icg, draw(st.integers(0, 65535)), Mode.STREAM, sequence)
+    count, sync = draw(st.integers(0, 65535)), draw(st.booleans())
+    if draw(st.booleans()):
+        return Command(sh, icg, count, Mode.STREAM, sequence, await_sync=sync)
+    frames = len(sequence) or 2
+    windows = draw(st.lists(st.lists(a_window(), max_size=8), min_size=frames, max_size=frames))
+    code = st.integers(0, 4095)
+    return Command(*(sh, icg, count, Mode.SPIKES, sequence, windows, draw(code), draw(code), sync))
+
+
+@st.composite
+def a_window(draw: st.DrawFn) -> tuple[int, int]:
+    first = draw(st.integers(0, PIXELS - 16))
+    return first, draw(st.integers(first + 15, PIXELS - 1))
 
 
 @settings(max_examples=300)
@@ -139,6 +162,24 @@ def test_extended_command_byte_for_byte() -> None:
     table = struct.pack("<QIQIQI", 1 << 63, 90 | 1 << 31, 3, 50, 0, 0)
     head = bytes.fromhex("4552 00000064 00007530 01 0102 01 03 00") + table
     assert command.encode() == (head + struct.pack("<I", slow_crc(head))).ljust(7388, b"\0")
+
+
+def test_command_of_spikes_mode_byte_for_byte() -> None:
+    command = Command(
+        *(100, 30000, 0x0102, Mode.SPIKES, [{0: 50, 63: 90}, {1: 30}]),
+        windows=[[(1, 16)], [(7, 99), (2, 200)]],
+        threshold=0x123,
+        await_sync=True,
+    )
+    table = struct.pack("<QIHH", 1 << 63, 90 | 1 << 31, 1, 16)
+    table += struct.pack("<QIHH", 1, 50, 0xFFFF, 0xFFFF)
+    table += struct.pack("<QIHH", 2, 30 | 1 << 31, 7, 99) + struct.pack("<QIHH", 0, 0, 2, 200)
+    for size, options in ((ORIGINAL_SIZE, 1), (SPIKES_SIZE, 3)):
+        head = bytes.fromhex("4552 00000064 00007530 02 0102 02 04") + bytes([options])
+        head += bytes.fromhex("6c07 2301") + table
+        assert command.encode(size) == (head + struct.pack("<I", slow_crc(head))).ljust(size, b"\0")
+    assert command.windows == (((1, 16),), ((7, 99), (2, 200)))
+    assert Command(100, 30000, 1, Mode.SPIKES, [{}]).windows == (((0, 3647),),)
 
 
 def test_default_sequence_is_the_thesis_pair() -> None:
@@ -170,8 +211,19 @@ def test_leds_of_a_frame() -> None:
         ((100, 30000, -1, Mode.STREAM), "-n -1: allowed are 0 to"),
         ((100.0, 30000, 2), "whole number"),
         ((100, True, 2), "whole number"),
-        ((100, 30000, 2, Mode.SPIKES), "mode"),
-        ((100, 30000, 2, 9), "mode"),
+        ((100, 30000, 2, 9), "mode = 9"),
+        ((100, 30000, 2, Mode.STREAM, [{}], [[(0, 99)]]), "Mode.SPIKES meant"),
+        ((100, 30000, 2, Mode.SPIKES, [{}], [[(0, 14)]]), "0 to 14: allowed are 16 pixels"),
+        ((100, 30000, 2, Mode.SPIKES, [{}], [[(0, 3648)]]), "within 0 to 3647"),
+        ((100, 30000, 2, Mode.SPIKES, [{}], [[(-1, 30)]]), "within 0 to 3647"),
+        ((100, 30000, 2, Mode.SPIKES, [{}], [(0, 99)]), "one window given instead of a list"),
+        ((100, 30000, 2, Mode.SPIKES, [{}], [[(0.5, 99)]]), "whole number"),
+        ((100, 30000, 2, Mode.SPIKES, [{}], [[(0, 99)] * 9]), "9: allowed are 8"),
+        ((100, 30000, 2, Mode.SPIKES, [{}], [[], []]), "2 for a sequence of 1 frames"),
+        ((100, 30000, 2, Mode.SPIKES, [{}] * 9, [[(0, 99)] * 8] * 9), "72 entries.*holds 64"),
+        ((100, 30000, 2, Mode.SPIKES, [{}], [], 4096), "saturated = 4096"),
+        ((100, 30000, 2, Mode.SPIKES, [{}], [], 0, -1), "threshold = -1"),
+        ((100, 30000, 2, Mode.ORIGINAL, [], [], 0, 0, True), "original mode begins at once"),
         ((100, 30000, 2, Mode.ORIGINAL, [{0: 10}]), "stream mode meant"),
         ((100, 30000, 2, Mode.STREAM, [{64: 10}]), "channels 0 to 63"),
         ((100, 30000, 2, Mode.STREAM, [{0: 101}]), "10 up to the SH period, 100"),
@@ -190,10 +242,16 @@ def test_bad_commands(arguments: tuple[object, ...], words: str) -> None:
 
 
 def test_size_of_a_transfer() -> None:
-    with pytest.raises(ValueError, match="7388 bytes in original mode and 7424"):
+    with pytest.raises(
+        ValueError, match="7388 bytes in original mode, 7424 in stream mode and 256"
+    ):
         Command(100, 30000, 2).encode(7000)
     assert Command(100, 30000, 2).size == ORIGINAL_SIZE
     assert Command(100, 30000, 2, Mode.STREAM).size == STREAM_SIZE
+    assert Command(100, 30000, 2, Mode.SPIKES).size == SPIKES_SIZE
+    assert len(Command(100, 30000, 2, Mode.SPIKES, [{}] * 14).encode(SPIKES_SIZE)) == SPIKES_SIZE
+    with pytest.raises(CommandError, match="15 entries do not fit into a transfer of spikes mode"):
+        Command(100, 30000, 2, Mode.SPIKES, [{}] * 15).encode(SPIKES_SIZE)
     assert Command(100, 30000, 2).frame_rate() == pytest.approx(133.333, rel=1e-5)
 
 
@@ -209,11 +267,13 @@ ENTRY = struct.pack("<QI", 1, 50)
 @pytest.mark.parametrize(
     ("data", "refusal"),
     [
-        (HEAD[:13] + b"\x02" + HEAD[14:] + ENTRY, Refusal.VERSION),
+        (HEAD[:13] + b"\x03" + HEAD[14:] + ENTRY, Refusal.VERSION),
+        (sealed(HEAD[:15] + b"\x01", ENTRY), Refusal.VERSION),
+        (sealed(HEAD[:13] + b"\x02\x01\x04", ENTRY), Refusal.VERSION),
         (sealed(HEAD[:14] + b"\0\0", b""), Refusal.TABLE),
         (HEAD[:14] + b"\x41\0" + bytes(800), Refusal.TABLE),
         (HEAD + ENTRY + bytes(4), Refusal.CHECKSUM),
-        (sealed(HEAD[:10] + b"\x02" + HEAD[11:], ENTRY), Refusal.MODE),
+        (sealed(HEAD[:10] + b"\x02" + HEAD[11:], ENTRY), Refusal.VERSION),
         (sealed(HEAD[:10] + b"\xff" + HEAD[11:], ENTRY), Refusal.MODE),
         (sealed(HEAD[:5] + b"\x03" + HEAD[6:], ENTRY), Refusal.PERIODS),
         (sealed(HEAD, struct.pack("<QI", 1, 101)), Refusal.TABLE),
@@ -241,8 +301,8 @@ def test_any_bytes_as_a_command(data: bytes, magic: bool) -> None:
 @given(commands(), st.data())
 @settings(max_examples=200)
 def test_damaged_extended_command_is_refused(command: Command, data: st.DataObject) -> None:
-    encoded = bytearray(command.encode()[:900])
-    end = 20 + 12 * encoded[14]
+    encoded = bytearray(command.encode()[:1100])
+    end = 20 + 12 * encoded[14] if command.mode is not Mode.SPIKES else 24 + 16 * encoded[14]
     at, bit = data.draw(st.integers(2, end - 1)), data.draw(st.integers(0, 7))
     encoded[at] ^= 1 << bit
     try:
@@ -393,6 +453,81 @@ def test_hundred_thousand_damaged_frames() -> None:
         assert found == FRAME
         same += 1
     assert same < 1000  # such as two bits that undo each other
+
+
+SPIKES = SpikeFrame(
+    (OnboardSpike(2.25, 7.5, 999, 5, 0), OnboardSpike(3647.0, 3648.0, 4095, 8, 1)),
+    windows=((0, 15), (1, 3647)),
+    dark_level=3901.0625,
+    sequence=0x12345678,
+    leds=0x8000_0000_0000_0021,
+    sh_period=100,
+    icg_period=30000,
+    timestamp=987_654_321_250,
+    flags=FrameFlags.DROPPED,
+)
+
+
+def test_spikes_byte_for_byte() -> None:
+    clocks = 987_654_321_250 * 4 // 1000
+    data = struct.pack("<HBBIQQII", 0x544C, 2, 1, 0x12345678, 1 << 63 | 33, clocks, 30000, 100)
+    data += struct.pack("<BBHI4H", 2, 2, 3901 * 16 + 1, 0, 0, 15, 1, 3647) + bytes(24)
+    data += struct.pack("<IHHBBH", 2304, 120, 999, 5, 0, 0)
+    data += struct.pack("<IHHBBH", 3647 * 1024, 58368, 4095, 8, 1, 0)
+    data = data.ljust(252, b"\0")
+    data += struct.pack("<I", slow_crc(data))
+    assert encode_spikes(SPIKES) == data
+    assert decode_spikes(data) == SPIKES
+    lit = decode_spikes(data, exposures={0: 7}, master_clock=2_000_000, utc_ns=3, monotonic_ns=4)
+    assert isinstance(lit, SpikeFrame)
+    assert (lit.exposures, lit.utc_ns, lit.monotonic_ns) == ({0: 7}, 3, 4)
+    assert lit.timestamp == 2 * 987_654_321_250
+    assert SPIKES.channels == (0, 5, 63)
+    with pytest.raises(ValueError, match="master_clock"):
+        SpikeFrame((), master_clock=0)
+
+
+def test_status_in_spikes_mode() -> None:
+    status = Status(Refusal.TABLE, "linetrack 0.1", 100, 30000, timestamp=250)
+    data = encode_status(status, mode=Mode.SPIKES)
+    assert len(data) == SPIKES_SIZE
+    assert decode_spikes(data) == status
+
+
+@pytest.mark.parametrize(
+    ("at", "value", "error"),
+    [
+        (0, 0, BadMagic),
+        (2, 1, BadVersion),
+        (3, 16, BadHeader),
+        (32, 9, BadHeader),
+        (33, 0, BadHeader),
+        (33, 9, BadHeader),
+        (72 + 9, 2, BadHeader),
+    ],
+)
+def test_intact_but_wrong_spikes(at: int, value: int, error: type[DecodeError]) -> None:
+    data = bytearray(encode_spikes(SPIKES)[:-4])
+    data[at] = value
+    with pytest.raises(error):
+        decode_spikes(bytes(data) + struct.pack("<I", slow_crc(bytes(data))))
+
+
+def test_damaged_spikes() -> None:
+    rng = random.Random(2304)  # noqa: S311
+    good = encode_spikes(SPIKES)
+    for _ in range(20_000):
+        data = bytearray(good)
+        for _ in range(rng.randint(1, 8)):
+            data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+        at = rng.randrange(len(data))
+        if rng.random() < 0.5:
+            data = (data[:at] + data[at + rng.randint(1, 9) :]).ljust(SPIKES_SIZE, b"\0")
+        if data != good:
+            with pytest.raises(DecodeError):
+                decode_spikes(data)
+    with pytest.raises(ShortFrame, match="in spikes mode has 256"):
+        decode_spikes(DATA)
 
 
 def test_garbage_is_no_frame() -> None:

@@ -44,6 +44,7 @@ def test_pins_of_the_thesis() -> None:
 def test_constants() -> None:
     assert PROTOCOL.original_size == 7388
     assert PROTOCOL.stream.frame_size == 7424
+    assert PROTOCOL.spikes.frame_size == 256
     assert wiring.sh_edge(PROTOCOL) == 9
     assert WIRING.leds.last_two == (0, 1)
     assert WIRING.mcu.clock == 21 * WIRING.mcu.master_clock
@@ -57,12 +58,13 @@ def test_objects_cannot_change() -> None:
 
 
 @pytest.mark.parametrize("flag", [1, 2, 4, 8])
-def test_flag_checksum(flag: int) -> None:
+@pytest.mark.parametrize("size", [PROTOCOL.stream.frame_size, PROTOCOL.spikes.frame_size])
+def test_flag_checksum(size: int, flag: int) -> None:
     protocol = pytest.importorskip("acquisition.protocol")
-    frame = bytearray(b"\x5a" * (PROTOCOL.stream.frame_size - 4))
+    frame = bytearray(b"\x5a" * (size - 4))
     before = protocol.crc32_words(bytes(frame))
     frame[3] ^= flag
-    assert protocol.crc32_words(bytes(frame)) ^ before == wiring.flag_checksum(PROTOCOL, flag)
+    assert protocol.crc32_words(bytes(frame)) ^ before == wiring.flag_checksum(size, flag)
 
 
 def test_command_line() -> None:
@@ -107,6 +109,10 @@ def test_standard_library_only() -> None:
         ("icg_min = 14776", "icg_min = 14775", "not the time of one read-out"),
         ("frame_size = 7424", "frame_size = 7420", "not header, elements and checksum"),
         ("header_size = 32", "header_size = 30", "not header, elements and checksum"),
+        ("frame_size = 256 ", "frame_size = 254 ", "spikes: the CRC unit takes words"),
+        ("table_at = 20 ", "table_at = 18 ", "spikes: the CRC unit takes words"),
+        ("version = 2 ", "version = 1 ", "has neither windows nor options"),
+        ('sync      = { pin = "PB1"', 'sync      = { pin = "PB0"', "PB0 is both fM and sync"),
         ("sh_pulse = 8", "sh_pulse = 19", "SH pulse ends after"),
         ("master_clock = 4_000_000", "master_clock = 3_900_000", "does not divide"),
     ],

@@ -85,13 +85,13 @@ def calls_and_frames(compiler: str) -> tuple[dict[str, set[str]], dict[str, int]
         with path.open("rb") as file:
             elf: Any = ELFFile(file)
             local = {
-                s.name
+                _unnumbered(s.name)
                 for s in elf.get_section_by_name(".symtab").iter_symbols()
                 if s["st_info"]["type"] == "STT_FUNC" and s["st_info"]["bind"] == "STB_LOCAL"
             }
 
             def named(name: str, local: set[str] = local, unit: str = path.stem) -> str:
-                name = name.removeprefix(".text.")
+                name = _unnumbered(name.removeprefix(".text.").removeprefix("startup."))
                 return f"{unit}.c:{name}" if name in local else name
 
             for section in elf.iter_sections():
@@ -112,6 +112,11 @@ def calls_and_frames(compiler: str) -> tuple[dict[str, set[str]], dict[str, int]
                 assert kind == "static", f"{where}: {kind} stack use cannot be bounded"
                 frames[named(where.split(":")[-1])] = int(size)
     return dict(calls), frames
+
+
+def _unnumbered(name: str) -> str:
+    """Name without the number of a clone, which gcc's listings do not have."""
+    return re.sub(r"\.\d+$", "", name)
 
 
 def _uleb(data: bytes) -> int:

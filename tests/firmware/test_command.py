@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 TABLE_MAX = PROTOCOL.stream.table_max
-SIZE = 16 + TABLE_MAX * PROTOCOL.stream.entry_size + 4
+SIZE = PROTOCOL.spikes.table_at + TABLE_MAX * PROTOCOL.spikes.entry_size + 4
 CHAIN = WIRING.leds.chain_first
 NO_STEP = 0xFF
 
@@ -37,6 +37,10 @@ class Step(ctypes.Structure):
     )
 
 
+class Window(ctypes.Structure):
+    _fields_ = (("first", ctypes.c_uint16), ("last", ctypes.c_uint16))
+
+
 class Plan(ctypes.Structure):
     _fields_ = (
         ("sh_period", ctypes.c_uint32),
@@ -46,6 +50,11 @@ class Plan(ctypes.Structure):
         ("frames", ctypes.c_uint8),
         ("first_step", ctypes.c_uint8 * (TABLE_MAX + 1)),
         ("steps", Step * TABLE_MAX),
+        ("windows", Window * TABLE_MAX),
+        ("first_window", ctypes.c_uint8 * (TABLE_MAX + 1)),
+        ("saturated", ctypes.c_uint16),
+        ("threshold", ctypes.c_uint16),
+        ("await_sync", ctypes.c_bool),
     )
 
 
@@ -61,6 +70,7 @@ def _compiled(folder: Path) -> Any:
     library = ctypes.CDLL(str(target))
     library.crc_words.restype = library.command_read.restype = ctypes.c_uint32
     library.command_present.restype = library.periods_valid.restype = ctypes.c_bool
+    library.command_brief.restype = ctypes.c_bool
     return library
 
 
@@ -73,6 +83,11 @@ def read(library: Any, data: bytes) -> tuple[Refusal, Plan]:
     plan = Plan()
     result = library.command_read(data.ljust(SIZE, b"\0")[:SIZE], ctypes.byref(plan))
     return Refusal(result), plan
+
+
+def windows(plan: Plan) -> list[list[tuple[int, int]]]:
+    starts = list(plan.first_window[: plan.frames + 1])
+    return [[(w.first, w.last) for w in plan.windows[a:b]] for a, b in itertools.pairwise(starts)]
 
 
 def frames(plan: Plan) -> list[list[Step]]:
@@ -101,13 +116,27 @@ def periods(draw: st.DrawFn) -> tuple[int, int]:
 
 
 @st.composite
+def a_window(draw: st.DrawFn) -> tuple[int, int]:
+    first = draw(st.integers(0, 3648 - 16))
+    return first, draw(st.integers(first + 15, 3647))
+
+
+@st.composite
 def commands(draw: st.DrawFn) -> Command:
     sh, icg = draw(periods())
     longest = min(sh, 0x7FFFFFFF)
     frame = st.dictionaries(st.integers(0, 63), st.integers(0, longest), max_size=5)
     sequence = draw(st.lists(frame, min_size=1, max_size=12))
+    mode = draw(st.sampled_from((Mode.STREAM, Mode.SPIKES)))
+    count, sync = draw(st.integers(0, 0xFFFF)), draw(st.booleans())
+    options: dict[str, Any] = {}
+    if mode is Mode.SPIKES:
+        code = st.integers(0, 4095)
+        places = st.lists(a_window(), max_size=8)
+        options["windows"] = draw(st.lists(places, min_size=len(sequence), max_size=len(sequence)))
+        options.update(saturated=draw(code), threshold=draw(code))
     try:
-        return Command(sh, icg, draw(st.integers(0, 0xFFFF)), Mode.STREAM, sequence)
+        return Command(sh, icg, count, mode, sequence, await_sync=sync, **options)
     except CommandError:
         assume(False)
         raise
@@ -146,7 +175,8 @@ def test_plan(library: Any, command: Command) -> None:
     refusal, plan = read(library, command.encode())
     assert refusal is Refusal.NONE
     assert (plan.sh_period, plan.icg_period) == (command.sh_period, command.icg_period)
-    assert (plan.count, plan.mode) == (command.count, Mode.STREAM)
+    assert (plan.count, plan.mode) == (command.count, command.mode)
+    assert plan.await_sync == command.await_sync
     found = frames(plan)
     assert len(found) == len(command.sequence)
     for steps, lit in zip(found, command.sequence, strict=True):
@@ -163,6 +193,9 @@ def test_plan(library: Any, command: Command) -> None:
         for step in steps:
             assert step.latch == (step.leds >> CHAIN != before >> CHAIN)
             before = step.leds
+    if command.mode is Mode.SPIKES:
+        assert windows(plan) == [list(of_frame) for of_frame in command.windows]
+        assert (plan.saturated, plan.threshold) == (command.saturated, command.threshold)
 
 
 @given(commands())
@@ -178,7 +211,9 @@ def test_next_pattern_of_the_chain(library: Any, command: Command) -> None:
 @given(commands(), st.data())
 def test_changed_bytes(library: Any, command: Command, data: st.DataObject) -> None:
     raw = bytearray(command.encode()[:SIZE])
-    bit = data.draw(st.integers(0, 8 * (16 + 12 * raw[14] + 4) - 1))
+    spikes = command.mode is Mode.SPIKES
+    length = (20 + 16 * raw[14] if spikes else 16 + 12 * raw[14]) + 4
+    bit = data.draw(st.integers(0, 8 * length - 1))
     assume(bit // 8 not in {10})
     raw[bit // 8] ^= 1 << bit % 8
     refusal, _ = read(library, bytes(raw))
@@ -197,21 +232,53 @@ def raw_command(
     entries: int | None = None,
     sh: int = 100,
     icg: int = 20000,
+    options: int = 0,
 ) -> bytes:
     number = len(table) // 12 if entries is None else entries
-    data = b"ER" + struct.pack(">IIBHBBB", sh, icg, mode, 3, version, number, 0) + table
+    data = b"ER" + struct.pack(">IIBHBBB", sh, icg, mode, 3, version, number, options) + table
     return data + crc32_words(data).to_bytes(4, "little")
+
+
+def windowed(*entries: tuple[int, int, int, int], limits: tuple[int, int] = (0, 0)) -> bytes:
+    table = b"".join(struct.pack("<QIHH", *values) for values in entries)
+    return raw_command(struct.pack("<HH", *limits) + table, mode=2, version=2, entries=len(entries))
+
+
+MORE = 1 << 31
+NONE = (0xFFFF, 0xFFFF)
 
 
 @pytest.mark.parametrize(
     ("data", "refusal"),
     [
+        (raw_command(entry(1, 100), options=1), Refusal.VERSION),
+        (raw_command(entry(1, 100), version=2, options=1), Refusal.NONE),
+        (raw_command(entry(1, 100), version=2, options=4), Refusal.VERSION),
+        (raw_command(entry(1, 100), version=3), Refusal.VERSION),
+        (windowed((1, 100, 0, 3647)), Refusal.NONE),
+        (windowed((1, 100, 0, 15)), Refusal.NONE),
+        (windowed((1, 100, 3632, 3647)), Refusal.NONE),
+        (windowed((1, 100, 0, 14)), Refusal.TABLE),
+        (windowed((1, 100, 20, 5)), Refusal.TABLE),
+        (windowed((1, 100, 0, 3648)), Refusal.TABLE),
+        (windowed((1, 100, 0xFFFF, 3647)), Refusal.TABLE),
+        (windowed((1, 100, *NONE)), Refusal.TABLE),
+        (windowed((1, 100 | MORE, *NONE), (2, 50, 0, 99)), Refusal.NONE),
+        (windowed((1, 100 | MORE, 7, 99), (0, MORE, 0, 99), (0, 0, 50, 99)), Refusal.NONE),
+        (windowed((1, 100 | MORE, 7, 99), (0, MORE, 0, 99), (1, 50, 50, 99)), Refusal.TABLE),
+        (windowed(*[(0, MORE, 0, 99)] * 7, (0, 0, 0, 99)), Refusal.NONE),
+        (windowed(*[(0, MORE, 0, 99)] * 8, (0, 0, 0, 99)), Refusal.TABLE),
+        (windowed((1, 101, 0, 99)), Refusal.TABLE),
+        (windowed((1, 100, 0, 99), limits=(4095, 4095)), Refusal.NONE),
+        (windowed((1, 100, 0, 99), limits=(4096, 0)), Refusal.TABLE),
+        (windowed((1, 100, 0, 99), limits=(0, 4096)), Refusal.TABLE),
+        (windowed(*[(1, 100, 0, 99)] * 64), Refusal.NONE),
         (raw_command(entry(1, 100)), Refusal.NONE),
         (raw_command(entry(1, 101)), Refusal.TABLE),
         (raw_command(entry(0, 101)), Refusal.NONE),
         (raw_command(entry(1, 0)), Refusal.NONE),
-        (raw_command(entry(1, 100), version=2), Refusal.VERSION),
-        (raw_command(entry(1, 100), mode=2), Refusal.MODE),
+        (raw_command(entry(1, 100), version=2), Refusal.NONE),
+        (raw_command(entry(1, 100), mode=2), Refusal.VERSION),
         (raw_command(entry(1, 100), mode=255), Refusal.MODE),
         (raw_command(entry(1, 100), sh=39), Refusal.PERIODS),
         (raw_command(entry(1, 100), icg=14700), Refusal.PERIODS),
@@ -241,19 +308,30 @@ def test_refusals(library: Any, data: bytes, refusal: Refusal) -> None:
     assert caught.value.refusal is refusal
 
 
-@given(st.binary(min_size=SIZE, max_size=SIZE), st.booleans())
-def test_anything(library: Any, data: bytes, sealed: bool) -> None:
+@given(st.binary(min_size=SIZE, max_size=SIZE), st.booleans(), st.sampled_from((1, 2)))
+def test_anything(library: Any, data: bytes, sealed: bool, mode: int) -> None:
     """Whatever comes: an answer, and a plan within its bounds."""
     raw = bytearray(data)
-    raw[:2], raw[10], raw[13] = b"ER", 1, 1
+    raw[:2], raw[10], raw[13], raw[15] = b"ER", mode, mode, 0
     raw[14] = 1 + raw[14] % TABLE_MAX
-    end = 16 + 12 * raw[14]
+    end = 16 + 12 * raw[14] if mode == 1 else 20 + 16 * raw[14]
     if sealed:
         raw[end : end + 4] = crc32_words(bytes(raw[:end])).to_bytes(4, "little")
     refusal, plan = read(library, bytes(raw))
     assert plan.frames <= TABLE_MAX
     if refusal is Refusal.NONE:
         assert all(0 < s.tick < plan.icg_period for steps in frames(plan) for s in steps)
+        for of_frame in windows(plan) if mode == 2 else ():
+            assert 1 <= len(of_frame) <= 8
+            assert all(a + 15 <= b <= 3647 for a, b in of_frame)
+
+
+def test_short_transfers(library: Any) -> None:
+    """A command for a stream that runs is obeyed at once, others when the clock rests."""
+    command = Command(100, 20000, 3, Mode.SPIKES)
+    assert library.command_brief(command.encode(256))
+    assert not library.command_brief(command.encode())
+    assert not library.command_brief(Command(100, 20000, 3, Mode.STREAM).encode(7424))
 
 
 def test_presence(library: Any) -> None:

@@ -30,7 +30,7 @@ RAM, RAM_SIZE = 0x2000_0000, 96 * 1024
 EXCEPTION_FRAME = 32 + 4  # eight registers, and the alignment to 8 bytes
 # each can interrupt those below, none its own kind
 PRIORITIES = (
-    ("TIM5_IRQHandler",),
+    ("TIM5_IRQHandler", "EXTI1_IRQHandler"),
     ("DMA2_Stream0_IRQHandler", "DMA2_Stream1_IRQHandler"),
     ("DMA1_Stream3_IRQHandler", "EXTI15_10_IRQHandler"),
     ("TIM2_IRQHandler",),
@@ -38,6 +38,7 @@ PRIORITIES = (
 )
 HANDLERS = {
     15: "SysTick_Handler",
+    16 + 7: "EXTI1_IRQHandler",
     16 + 14: "DMA1_Stream3_IRQHandler",
     16 + 28: "TIM2_IRQHandler",
     16 + 40: "EXTI15_10_IRQHandler",

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquisition.capture import Capture
-from acquisition.frames import LEADING, PIXELS, Frame
+from acquisition.frames import LEADING, PIXELS, Frame, SpikeFrame
 from acquisition.links import LinkError
 from acquisition.protocol import Command, Mode
+from tracking.onboard import find_spikes
 from twin.link import TwinLink
 from twin.machine import CLOCK
 
@@ -24,6 +25,12 @@ if TYPE_CHECKING:
 STREAM = Command(200, 20000, 0, mode=Mode.STREAM, sequence=[{0: 200}, {1: 100}, {}])
 """200 frames a second: slower than the link, so that nothing is dropped without a fault."""
 
+SPIKES = Command(
+    *(200, 20000, 0, Mode.SPIKES, [{0: 200}, {1: 100}]),
+    windows=[[(0, 3647)], [(2400, 2650), (100, 130)]],
+)
+"""The same with spikes. No frame is unlit: of those, one is like the other."""
+
 
 class FaultyLink(TwinLink):
     """The twin behind a bad cable: one fault of a kind for each call of `strike`.
@@ -34,7 +41,8 @@ class FaultyLink(TwinLink):
 
     def __init__(self, seed: int, **options: Any) -> None:
         self.rng = np.random.Generator(np.random.PCG64(seed))
-        self.readouts: dict[bytes, tuple[float, int]] = {}  # pixels: time of transfer, LEDs
+        # by pixels: time of transfer, LEDs, all elements
+        self.readouts: dict[bytes, tuple[float, int, NDArray[np.uint16]]] = {}
         self.fault: str | None = None
         self.after = 0  # transfers that are still left alone
         self.over = 0.0  # virtual time at which the last fault was over
@@ -51,6 +59,7 @@ class FaultyLink(TwinLink):
             self.readouts[codes[LEADING : LEADING + PIXELS].tobytes()] = (
                 last["transfer"] / CLOCK,
                 leds,
+                codes.copy(),
             )
             while len(self.readouts) > 64:
                 self.readouts.pop(next(iter(self.readouts)))
@@ -203,7 +212,14 @@ class Report:
         return "\n".join(lines)
 
 
-def torture(seed: int, faults: int, kinds: tuple[str, ...], *, between: int = 2) -> Report:
+def torture(
+    seed: int,
+    faults: int,
+    kinds: tuple[str, ...],
+    *,
+    between: int = 2,
+    command: Command = STREAM,
+) -> Report:
     """Let faults strike a running stream, and judge every frame that is delivered.
 
     Raises
@@ -213,7 +229,7 @@ def torture(seed: int, faults: int, kinds: tuple[str, ...], *, between: int = 2)
     """
     report = Report()
     with FaultyLink(seed) as link:
-        frames = Capture(link, STREAM, retries=8)
+        frames = Capture(link, command, retries=8)
         first = next(frames)
         booted, before = _device_clock(link, first), first.sequence
         newest = first.sequence
@@ -222,7 +238,7 @@ def torture(seed: int, faults: int, kinds: tuple[str, ...], *, between: int = 2)
             struck, start = link.struck[kind], link.machine.seconds
             link.strike(kind)
             try:
-                delivered = []
+                delivered: list[Frame | SpikeFrame] = []
                 for frame in islice(frames, between + 1):
                     report.corrupt += not _is_what_was_digitised(link, frame)
                     report.corrupt += frame.sequence <= newest
@@ -242,7 +258,7 @@ def torture(seed: int, faults: int, kinds: tuple[str, ...], *, between: int = 2)
     return report
 
 
-def _device_clock(link: FaultyLink, frame: Frame) -> float:
+def _device_clock(link: FaultyLink, frame: Frame | SpikeFrame) -> float:
     """Virtual time at which the device's clock was 0, from a frame that has just been read out."""
     readouts = link.machine.readouts
     last = readouts[readouts["sampled"] > 0][-2:]["transfer"] / CLOCK
@@ -250,14 +266,26 @@ def _device_clock(link: FaultyLink, frame: Frame) -> float:
     return float(min(last - stamp, key=abs))
 
 
-def _is_what_was_digitised(link: FaultyLink, frame: Frame) -> bool:
-    """Whether pixels, LEDs and time are those of one read-out, not delivered before."""
-    time, leds = link.readouts.pop(frame.pixels.tobytes(), (0.0, -1))
+def _is_what_was_digitised(link: FaultyLink, frame: Frame | SpikeFrame) -> bool:
+    """Whether pixels (or spikes), LEDs and time are those of one read-out, not delivered before."""
+    key = _source(link, frame) if isinstance(frame, SpikeFrame) else frame.pixels.tobytes()
+    time, leds, _ = link.readouts.pop(key, (0.0, -1, None))
     on_the_way = link.machine.seconds - time
     return frame.leds == leds and 0 < on_the_way < 0.06
 
 
-def _lost(link: FaultyLink, delivered: list[Frame], booted: float) -> int:
+def _source(link: FaultyLink, frame: SpikeFrame) -> bytes:
+    """The read-out that has these spikes, to the last bit, in the windows asked for."""
+    place = [sum(1 << n for n in lit) for lit in SPIKES.sequence].index(frame.leds)
+    for key, (_, leds, codes) in reversed(link.readouts.items()):
+        if leds == frame.leds and frame.windows == SPIKES.windows[place]:
+            expected = find_spikes(Frame(codes), frame.windows)
+            if (expected.spikes, expected.dark_level) == (frame.spikes, frame.dark_level):
+                return key if frame.spikes else b""
+    return b""
+
+
+def _lost(link: FaultyLink, delivered: list[Frame | SpikeFrame], booted: float) -> int:
     """Count the read-outs since the fault that are not among the frames delivered."""
     period = STREAM.icg_period / 4e6
     stamps = [booted + (frame.timestamp or 0) * 1e-9 for frame in delivered]
@@ -267,6 +295,6 @@ def _lost(link: FaultyLink, delivered: list[Frame], booted: float) -> int:
     return int((after[-1] - link.over) / period) - (len(after) - 1)
 
 
-def _silence(link: FaultyLink, delivered: list[Frame], start: float) -> float:
+def _silence(link: FaultyLink, delivered: list[Frame | SpikeFrame], start: float) -> float:
     period = STREAM.icg_period / 4e6
     return link.machine.seconds - start - (len(delivered) - 1) * period

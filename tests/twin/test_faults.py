@@ -11,18 +11,20 @@ import pytest
 from acquisition.capture import Capture, capture
 from acquisition.frames import FrameFlags
 from acquisition.protocol import Command
-from tests.twin.faults import DEVICE_FAULTS, LINK_FAULTS, STREAM, FaultyLink, torture
+from tests.twin.faults import DEVICE_FAULTS, LINK_FAULTS, SPIKES, STREAM, FaultyLink, torture
 
 CASES = 2000 if "CI" in os.environ else 400
 SHARE = 0.15  # of the cases for faults after which the host must begin anew: they take longer
 
 
-def test_stream_survives_a_bad_link() -> None:
-    report = torture(seed=11, faults=round(CASES * (1 - SHARE)), kinds=LINK_FAULTS)
+@pytest.mark.parametrize("command", [STREAM, SPIKES], ids=["pixels", "spikes"])
+def test_stream_survives_a_bad_link(command: Command) -> None:
+    faults = round(CASES * (1 - SHARE))
+    report = torture(seed=11, faults=faults, kinds=LINK_FAULTS, command=command)
     print(f"\n{report}")
     assert report.corrupt == 0
     assert set(report.lost) == set(LINK_FAULTS)
-    assert sum(report.faults.values()) >= round(CASES * (1 - SHARE))
+    assert sum(report.faults.values()) >= faults
     for kind, lost in report.lost.items():
         assert max(lost) <= 2, kind
     # a short or broken transfer costs at most its own frame
@@ -32,13 +34,15 @@ def test_stream_survives_a_bad_link() -> None:
     assert max(report.missing["bytes doubled"]) <= 2
 
 
-def test_stream_survives_resets_and_garbage_commands() -> None:
-    """The device may have left stream mode: the host finds out, and begins anew."""
-    report = torture(seed=12, faults=round(CASES * SHARE), kinds=DEVICE_FAULTS)
+@pytest.mark.parametrize("command", [STREAM, SPIKES], ids=["pixels", "spikes"])
+def test_stream_survives_resets_and_garbage_commands(command: Command) -> None:
+    """The device may have left its mode: the host finds out, and begins anew."""
+    faults = round(CASES * SHARE)
+    report = torture(seed=12, faults=faults, kinds=DEVICE_FAULTS, command=command)
     print(f"\n{report}")
     assert report.corrupt == 0
     assert set(report.faults) == set(DEVICE_FAULTS)
-    assert sum(report.faults.values()) >= round(CASES * SHARE)
+    assert sum(report.faults.values()) >= faults
     for kind, silent in report.silent.items():
         assert max(silent) < 0.2, kind
 

@@ -5,13 +5,15 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
-from acquisition.capture import capture
+from acquisition.capture import Capture, SpikeCapture, capture
+from acquisition.frames import FrameFlags
 from acquisition.protocol import Command, Mode
 from twin.link import IMAGE, TwinLink
 from twin.machine import TimingViolation
@@ -69,7 +71,7 @@ def test_an_adc_that_starts_early_reads_everything_late(
 
 
 def test_a_short_sh_pulse_is_refused(variant: Callable[[str, str, str], Path]) -> None:
-    image = variant("sensor.c", "TIM2->CCR2 = SH_PULSE;", "TIM2->CCR2 = 3u;")
+    image = variant("sensor.c", "pulses ? SH_PULSE : 0;", "pulses ? 3u : 0;")
     with pytest.raises(TimingViolation, match="t3"):
         elements(image)
 
@@ -109,6 +111,39 @@ def test_a_missed_conversion_costs_one_frame(
     assert len(numbers) >= 7
     assert numbers[-1] == 8
     assert all(np.array_equal(frame.elements, NUMBERED[:3694]) for frame in frames)
+
+
+@pytest.mark.parametrize("icg", [14800, 20000])
+def test_a_slow_search_for_spikes_costs_frames_and_nothing_else(
+    variant: Callable[[str, str, str], Path], icg: int
+) -> None:
+    """What is read out meanwhile waits, the newest one; buffers suffice all the same."""
+    search = "    spikes_find(frame->elements"
+    slow = "    for (volatile uint32_t n = 0; n < 70000u; n++) {\n    }\n" + search
+    image = variant("frames.c", search, slow)
+    command = Command(200, icg, 0, Mode.SPIKES, [{0: 200}, {1: 200}])
+    with TwinLink(image=image) as link, SpikeCapture(link, command) as frames:
+        found = list(islice(frames, 40))
+        stamps = [frame.timestamp or 0 for frame in found]
+        assert 8 < frames.statistics.dropped < 80
+        assert frames.statistics.corrupt == frames.statistics.restarts == 0
+        link.sleep(0.05)  # a host that does not read either
+        found += islice(frames, 10)
+        frames.send([{5: 20}])
+        assert list(islice(frames, 10))[-1].leds == 1 << 5
+    assert np.diff(stamps).max() < 0.02e9
+    for frame, after in pairwise(found):
+        assert bool(after.flags & FrameFlags.DROPPED) == (after.sequence > frame.sequence + 1)
+        assert frame.leds == 1 + frame.sequence % 2
+        at = 1117.8 if frame.leds == 1 else 2529.2
+        assert [round(spike.position - at) for spike in frame.spikes] == [0]
+    # the search that was under way when another capture begins is not that one's
+    with TwinLink(image=image) as link:
+        for mode in (Mode.SPIKES, Mode.STREAM, Mode.SPIKES, Mode.ORIGINAL, Mode.SPIKES):
+            count = 2 if mode is Mode.ORIGINAL else 0
+            with Capture(link, Command(200, icg, count, mode)) as mixed:
+                assert len(list(islice(mixed, 2))) == 2
+                assert mixed.statistics.corrupt == mixed.statistics.invalid == 0
 
 
 def test_an_led_that_is_never_lit_is_not_seen(variant: Callable[[str, str, str], Path]) -> None:

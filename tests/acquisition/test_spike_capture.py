@@ -1,0 +1,172 @@
+"""Capture in spikes mode against a fake device: as in stream mode, but for what is in a frame."""
+
+from __future__ import annotations
+
+from itertools import islice
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from acquisition.capture import Capture, Refused, SpikeCapture, capture
+from acquisition.frames import Frame, FrameFlags, SpikeFrame
+from acquisition.links import LinkError, ReplayLink
+from acquisition.protocol import FULL_WINDOW, Command, CommandError, Mode, Refusal
+from acquisition.session import SessionError, SessionWriter
+from tests.acquisition.fake_mcu import BREAKS, FakeMcu, FaultyWire, elements_at, spikes_at
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+LEDS = [{0: 100}, {1: 60}, {}, {0: 100, 1: 30}]
+WINDOWS = [[(0, 99)], [(7, 300), (400, 500)], [], [(1, 3000)]]
+
+
+def spikes(count: int = 0) -> Command:
+    return Command(100, 20000, count, Mode.SPIKES, LEDS, WINDOWS)
+
+
+def check(frames: Iterable[SpikeFrame]) -> None:
+    """Every frame is one that the device has taken."""
+    for frame in frames:
+        assert frame.timestamp is not None
+        assert frame.spikes == spikes_at(frame.timestamp // 1000)
+        assert frame.dark_level == 3900.5
+
+
+def test_spikes_come_with_all_that_is_known_of_their_frame() -> None:
+    link = FakeMcu()
+    frames = SpikeCapture(link, spikes(9))
+    found = list(frames)
+    check(found)
+    assert [frame.sequence for frame in found] == list(range(9))
+    assert [frame.exposures for frame in found[:4]] == LEDS
+    assert found[1].windows == ((7, 300), (400, 500))
+    assert found[2].windows == (FULL_WINDOW,)
+    assert all(frame.utc_ns > 0 and frame.monotonic_ns > 0 for frame in found)
+    assert (found[0].sh_period, found[0].icg_period) == (100, 20000)
+    assert frames.statistics.good == 9
+    assert frames.status is not None
+
+
+@pytest.mark.parametrize("then", list(Mode))
+def test_an_endless_capture_is_stopped_and_one_in_any_mode_follows(then: Mode) -> None:
+    link = FakeMcu()
+    with SpikeCapture(link, spikes()) as frames:
+        check(islice(frames, 5))
+    assert link.commands[-1].leds(0) == {}
+    following = Capture(link, Command(100, 30000, 3, then))
+    assert len(list(following)) == 3
+    assert following.statistics.restarts == following.statistics.corrupt == 0
+
+
+@pytest.mark.parametrize("then", list(Mode))
+def test_a_running_capture_of_somebody_else_is_taken_over(then: Mode) -> None:
+    """Its transfers have another length than the command's, which the new host cannot know."""
+    link = FakeMcu()
+    check(islice(SpikeCapture(link, spikes()), 5))
+    following = Capture(link, Command(200, 24000, 4, then))
+    found = list(following)
+    assert [frame.sequence for frame in found] == list(range(4))
+    assert following.statistics.restarts == 0
+
+
+def test_windows_and_leds_change_on_the_way() -> None:
+    link = FakeMcu()
+    frames = SpikeCapture(link, spikes())
+    found = list(islice(frames, 5))
+    change = Command(100, 20000, 0, Mode.SPIKES, [{3: 50}], [[(500, 600)]], await_sync=True)
+    frames.send(change)
+    found += islice(frames, 4)
+    frames.send([{}, {5: 20}])
+    found += islice(frames, 4)
+    check(found)
+    assert [frame.sequence for frame in found] == list(range(13))
+    assert sum(bool(frame.flags & FrameFlags.CHANGED) for frame in found) == 3
+    assert (found[8].windows, found[8].exposures) == (((500, 600),), {3: 50})
+    assert not link.commands[1].await_sync, "a stream that runs waits for nothing"
+    assert found[-1].windows == (FULL_WINDOW,)
+    assert frames.statistics.restarts == 0
+
+
+def test_what_cannot_be_sent_says_so_at_once() -> None:
+    frames = SpikeCapture(FakeMcu(), spikes())
+    with pytest.raises(CommandError, match="15 entries do not fit"):
+        frames.send([{}] * 15)
+    with pytest.raises(ValueError, match="in spikes mode cannot go over to stream mode"):
+        frames.send(Command(100, 20000, 0, Mode.STREAM))
+    with pytest.raises(ValueError, match="in stream mode cannot go over to spikes mode"):
+        Capture(FakeMcu(), Command(100, 20000, 0, Mode.STREAM)).send(spikes())
+    with pytest.raises(ValueError, match="SPIKES is needed here"):
+        SpikeCapture(FakeMcu(), Command(100, 20000, 0, Mode.STREAM))
+    # but a new capture takes them
+    assert len(list(capture(FakeMcu(), Command(100, 20000, 70, Mode.SPIKES, [{}] * 64)))) == 70
+
+
+def test_only_the_first_start_awaits_an_edge() -> None:
+    link = FaultyWire(1, 1.0, ["reset"])
+    link.quiet = link.once = True
+    command = Command(100, 20000, 0, Mode.SPIKES, await_sync=True)
+    frames = SpikeCapture(link, command)
+    check(islice(frames, 3))
+    assert link.commands[-1].await_sync
+    link.quiet = False
+    check(islice(frames, 3))
+    assert link.injected == ["reset"]
+    assert not link.commands[-1].await_sync
+
+
+@pytest.mark.parametrize("fault", sorted(BREAKS))
+def test_one_fault_costs_two_frames_at_most(fault: str) -> None:
+    for at in range(12):
+        link = FaultyWire(at, 1.0, [fault])
+        link.quiet = True
+        frames = SpikeCapture(link, spikes())
+        found = list(islice(frames, 4))
+        link.quiet, link.once = False, True
+        found += islice(frames, 6)
+        check(found)
+        assert found[-1].sequence + 1 - len(found) <= 2
+        assert link.injected == [fault]
+        assert frames.statistics.restarts == 0
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_spikes_over_a_bad_wire(seed: int) -> None:
+    link = FaultyWire(seed, 0.08, [*BREAKS, "flip tx", "bounce", "deaf", "reset"])
+    frames = SpikeCapture(link, spikes(), retries=20)
+    found = []
+    for n in range(150):
+        if n % 25 == 0:
+            frames.send([{n // 25 + 2: 10}, {0: 99}])
+        found.append(next(frames))
+    check(found)
+    assert len(link.injected) > 5
+    numbers = [frame.sequence for frame in found]
+    assert numbers == sorted(set(numbers))
+    for frame in found:
+        if frame.exposures and frame.timestamp is not None:
+            assert frame.exposures == link.lit[frame.timestamp // 1000]
+
+
+def test_older_firmware_refuses() -> None:
+    class Older(FakeMcu):
+        def _act(self, received: bytes) -> None:
+            if received[:2] == b"ER" and received[10]:
+                self._refuse(received[10], Refusal.VERSION)
+
+    with pytest.raises(Refused, match=r"version.*same release"):
+        list(capture(Older(), spikes(3)))
+
+
+def test_recordings_have_pixels(tmp_path: Path) -> None:
+    frame = Frame(elements_at(0), sh_period=100, icg_period=20000)
+    with pytest.raises(LinkError, match="replay it in stream mode"):
+        list(capture(ReplayLink([frame] * 3), spikes(3)))
+    with (
+        SessionWriter(tmp_path / "spikes.h5") as writer,
+        pytest.raises(SessionError, match="record in stream mode"),
+    ):
+        writer.append([SpikeFrame(())])  # type: ignore[list-item]
+    assert np.array_equal(frame.elements, elements_at(0))
