@@ -7,7 +7,7 @@ import sys
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor, as_completed
 
-from tests.twin.faults import DEVICE_FAULTS, LINK_FAULTS, Report, torture
+from tests.twin.faults import DEVICE_FAULTS, LINK_FAULTS, SPIKES, STREAM, Report, torture
 
 EACH = 1000
 
@@ -24,9 +24,16 @@ def main() -> int:
     silent: dict[str, float] = {}
     corrupt = 0
     with ProcessPoolExecutor() as pool:
-        # one run in eight with what makes the device forget its mode: that takes longer
+        # one run in eight with what makes the device forget its mode: that takes longer;
+        # every other one with spikes instead of pixels
         futures = [
-            pool.submit(torture, arguments.seed + n, EACH, LINK_FAULTS if n % 8 else DEVICE_FAULTS)
+            pool.submit(
+                torture,
+                arguments.seed + n,
+                EACH,
+                DEVICE_FAULTS if n % 16 in (0, 9) else LINK_FAULTS,
+                command=SPIKES if n % 2 else STREAM,
+            )
             for n in range(runs)
         ]
         for done, future in enumerate(as_completed(futures), start=1):
