@@ -1,0 +1,452 @@
+"""The tracker: from frames to poses, from the first light on, through loss and recovery."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from scipy.stats import chi2  # type: ignore[import-untyped]
+
+from acquisition.capture import Capture
+from acquisition.frames import ELEMENTS, LEADING, PIXELS, Frame, FrameFlags, SpikeFrame
+from acquisition.links import ReplayLink
+from acquisition.protocol import Mode
+from raytransfer.designs import DESIGNS
+from tracking.calibration import Calibration
+from tracking.camera import Camera
+from tracking.leds import LedMap
+from tracking.motion import Outcome
+from tracking.poses import Estimate, PoseFlags, Prior, optical
+from tracking.tracker import Step, Tracker, default_schedule, first_command, follow, track
+from twin.link import TwinLink
+from twin.machine import CLOCK
+from twin.rooms import load_room
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+ICG = 14800
+PERIOD = 3_700_000  # ns
+CAMERA = Camera(3500.0, 1830.0, (0.02,), pupil=8.0, model_error=0.01)
+TWO = LedMap.line(2, 500.0)
+NINE = LedMap.line(9, 500.0, 300.0)
+GAIN = 47.0  # electrons per code
+PEAK = 2.5e9  # electrons mm² per clock
+
+Pose = tuple[float, float, float]
+
+
+@dataclass
+class Room:
+    """Frames as a narrow-spiked head would see them; light as in the inverse square law."""
+
+    leds: LedMap
+    path: Callable[[float], Pose]
+    hidden: Callable[[float], set[int]] = lambda _: set()
+    ghosts: Callable[[float], list[tuple[float, float]]] = lambda _: []
+    seed: int = 1304
+    power: float = 1.0
+    number: int = 0
+    truth: dict[int, Pose] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._rng = np.random.default_rng(self.seed)
+
+    def frame(self, lit: Mapping[int, int], **options: Any) -> Frame:
+        t_ns = 30_000_000 + self.number * PERIOD
+        self.truth[t_ns] = self.path(t_ns * 1e-9)
+        electrons = np.full(PIXELS, 200.0)
+        places = np.arange(PIXELS)
+        hidden = self.hidden(t_ns * 1e-9)
+        spikes = []
+        for channel, clocks in lit.items():
+            middle = self.path((t_ns - clocks * 125) * 1e-9)
+            (point,) = optical(self.leds.positions[[self.leds.index(channel)]], *middle)
+            if channel not in hidden and point[2] > 100:
+                height = self.power * PEAK * clocks / float(point @ point)
+                spikes.append((float(CAMERA.project(point)), height))
+        for at, height in [*spikes, *self.ghosts(t_ns * 1e-9)]:
+            electrons += height * np.exp(-(((places - at) / 5.0) ** 2) / 2)
+        noisy = self._rng.poisson(np.minimum(electrons, 85_000)) + self._rng.normal(0, 60, PIXELS)
+        elements = np.full(ELEMENTS, 3900.0)
+        elements[LEADING : LEADING + PIXELS] -= noisy / GAIN
+        values = {
+            "sequence": self.number,
+            "leds": sum(1 << channel for channel in lit),
+            "exposures": dict(lit),
+            "sh_period": 100,
+            "icg_period": ICG,
+            "timestamp": t_ns,
+            **options,
+        }
+        self.number += 1
+        return Frame(np.rint(np.clip(elements, 0, 4095)).astype(np.uint16), **values)
+
+    def run(self, tracker: Tracker, count: int) -> list[Step]:
+        """Light what the tracker asks for, three frames late as over the link."""
+        planned: list[dict[int, int]] = tracker.sequence() or []
+        now, steps = planned, []
+        waiting: list[tuple[int, list[dict[int, int]]]] = []
+        for number in range(count):
+            steps.append(tracker.step(self.frame(now[number % len(now)])))
+            if (wanted := tracker.sequence()) is not None:
+                waiting.append((number + 3, wanted))
+            if waiting and waiting[0][0] <= number:
+                now = waiting.pop(0)[1]
+        return steps
+
+    def errors(self, steps: Sequence[Step]) -> NDArray[np.float64]:
+        """Estimate − truth of x, y and heading, of the steps with a pose."""
+        return np.array(
+            [np.subtract(pose(s.estimate), self.truth[s.t_ns]) for s in steps if s.estimate]
+        )
+
+
+def pose(estimate: Estimate) -> Pose:
+    return estimate.x, estimate.y, estimate.heading
+
+
+def rest(x: float, y: float, heading: float = 0.0) -> Callable[[float], Pose]:
+    return lambda _: (x, y, heading)
+
+
+def circle(seconds: float) -> Pose:
+    """1 m/s around (0, 2500), turning by ± 10°."""
+    angle = seconds / 0.6
+    return (
+        600 * math.sin(angle),
+        2500 + 600 * math.cos(angle),
+        math.radians(10) * math.sin(2 * seconds),
+    )
+
+
+def tracker(leds: LedMap, **options: Any) -> Tracker:
+    return Tracker(Calibration(CAMERA, leds), **{"led_error": 0.0, **options})
+
+
+# --- two LEDs ---------------------------------------------------------------------------------------
+
+
+def test_two_leds_with_known_heading() -> None:
+    room = Room(TWO, rest(120.0, 1700.0))
+    steps = room.run(tracker(TWO), 60)
+    assert [s.estimate is None for s in steps[:2]] == [True, False]  # each LED once
+    assert all(s.estimate for s in steps[1:])
+    last = steps[-1].estimate
+    assert last is not None
+    assert last.flags == PoseFlags.HEADING_ASSUMED
+    assert last.heading == 0
+    assert last.covariance[2, 2] == 0
+    error = room.errors(steps[20:])
+    sigma = np.sqrt(np.diag(last.covariance))[:2]
+    assert (np.abs(error[:, :2]).max(axis=0) < 4 * sigma).all()
+    assert (sigma < (0.1, 1.0)).all()
+
+
+def test_a_heading_that_is_given_is_used() -> None:
+    turned = math.radians(12)
+    room = Room(TWO, rest(-200.0, 2000.0, turned))
+    wrong = room.errors(room.run(tracker(TWO), 40))[-1]
+    right = room.errors(room.run(tracker(TWO, heading=Prior(turned, 0.0)), 40))[-1]
+    assert abs(wrong[0]) > 300
+    assert abs(right[0]) < 0.5
+    assert abs(right[1]) < 2
+
+
+def test_the_time_is_the_end_of_the_exposure() -> None:
+    """LEDs that are lit for 1 ms show where the tracker was half of that earlier."""
+    room = Room(TWO, lambda s: (1000 * (s - 0.1), 2000.0, 0.0), power=1 / 40)
+    follower = tracker(TWO)
+    steps = [follower.step(room.frame({0: 4000, 1: 4000}, sh_period=4000)) for _ in range(60)]
+    assert abs(room.errors(steps[30:])[:, 0].mean()) < 0.1  # not 0.5 mm
+
+
+# --- three and more -------------------------------------------------------------------------------
+
+
+def test_heading_is_measured_with_three_and_more() -> None:
+    leds = LedMap.line(3, 500.0, 300.0)
+    turned = math.radians(-7)
+    room = Room(leds, rest(50.0, 2200.0, turned))
+    steps = room.run(tracker(leds), 150)
+    last = steps[-1].estimate
+    assert last is not None
+    assert last.flags == PoseFlags.NONE
+    error = np.abs(room.errors(steps[80:])).max(axis=0)
+    assert (error < 5 * np.sqrt(np.diag(last.covariance))).all()
+    assert (error < (3, 1, 2e-3)).all()
+
+
+def test_follows_at_a_metre_per_second() -> None:
+    room = Room(NINE, circle)
+    steps = room.run(tracker(NINE), 540)
+    first = next(n for n, s in enumerate(steps) if s.estimate)
+    assert first < 3 * len(NINE)
+    known = steps[first + 20 :]
+    assert not any(s.estimate.flags & PoseFlags.LOST for s in known if s.estimate)
+    rms = np.sqrt((room.errors(known) ** 2).mean(axis=0))
+    assert (rms < (1.0, 0.5, 5e-4)).all(), rms
+    seen = [i for s in known for i in s.innovations]
+    assert np.mean([i.outcome is Outcome.USED for i in seen]) > 0.98
+    # several LEDs a frame, and their exposures such that no spike is full
+    assert np.mean([len(s.lit) for s in known]) > 2.5
+    for step in known:
+        for channel, clocks in step.frame.exposures.items():
+            at = room.leds.positions[room.leds.index(channel)]
+            distance = math.dist(at[:2], room.truth[step.t_ns][:2])
+            assert PEAK * clocks / distance**2 < 60_000
+
+
+def test_errors_are_not_larger_than_stated() -> None:
+    """Normalised by the covariance, over many runs: 3 on average for three unknowns, or less."""
+    values = []
+    for seed in range(12):
+        room = Room(NINE, circle, seed=seed)
+        step = room.run(tracker(NINE), 60)[-1]
+        assert step.estimate is not None
+        error = np.subtract(pose(step.estimate), room.truth[step.t_ns])
+        values.append(error @ np.linalg.solve(step.estimate.covariance, error))
+    assert np.mean(values) < chi2.ppf(0.999, 3 * len(values)) / len(values)
+
+
+def test_a_reflection_outside_the_window_is_not_looked_at() -> None:
+    room = Room(NINE, circle, ghosts=lambda s: [(500.0, 50_000.0)] if 0.3 < s < 0.6 else [])
+    steps = [s for s in room.run(tracker(NINE), 170) if s.t_ns > 0.3e9]
+    assert len(steps) > 75
+    assert np.abs(room.errors(steps)).max(axis=0)[0] < 1
+    assert all(s.estimate and s.estimate.flags == PoseFlags.NONE for s in steps)
+
+
+def test_a_lamp_that_a_spike_meets_is_told() -> None:
+    """Brighter than the LED, and always on: what it pulls away is flagged, and comes back."""
+    room = Room(NINE, circle, ghosts=lambda s: [(500.0, 50_000.0)] if 0.3 < s < 0.9 else [])
+    steps = room.run(tracker(NINE), 400)
+    bad = PoseFlags.LOST | PoseFlags.REJECTED | PoseFlags.PREDICTED | PoseFlags.INCONSISTENT
+    met = [s.estimate.flags & bad for s in steps if s.estimate and 0.6 < s.t_ns * 1e-9 < 0.8]
+    assert sum(map(bool, met)) > 5
+    plain = [s for s in steps[60:] if s.estimate and not s.estimate.flags & bad]
+    assert np.abs(room.errors(plain)).max(axis=0)[0] < 6
+    after = [s for s in steps if s.t_ns * 1e-9 > 1.3]
+    assert np.abs(room.errors(after)).max(axis=0)[0] < 1
+
+
+# --- loss and recovery ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("leds", "path"), [(TWO, rest(0, 1800)), (NINE, circle)])
+def test_lock_is_lost_and_found_again(leds: LedMap, path: Callable[[float], Pose]) -> None:
+    gone, back = 0.5, 1.2
+    room = Room(leds, path, hidden=lambda s: set(leds.channels) if gone < s < back else set())
+    steps = room.run(tracker(leds), 540)
+    times = np.array([s.t_ns * 1e-9 for s in steps])
+    flags = [s.estimate.flags if s.estimate else PoseFlags.LOST for s in steps]
+    lost = np.array([bool(f & PoseFlags.LOST) for f in flags])
+    assert not lost[(times > 0.2) & (times < gone)].any()
+    assert lost[(times > gone + 0.45) & (times < back)].all()
+    before = [f for f, t in zip(flags, times, strict=True) if gone < t < gone + 0.2]
+    assert all(f & (PoseFlags.PREDICTED | PoseFlags.LOST) for f in before)
+    found = times[~lost & (times > back)][0]
+    assert found - back < 0.5
+    assert not lost[times >= found].any()
+    again = [t for f, t in zip(flags, times, strict=True) if f & PoseFlags.RELOCALISED]
+    assert again == [found]  # and not in the beginning
+    settled = [s for s in steps if s.t_ns * 1e-9 > found + 0.1]
+    assert np.abs(room.errors(settled)).max(axis=0)[:2].max() < 10
+
+
+def test_a_lost_pose_gets_less_sure_and_stays() -> None:
+    room = Room(TWO, rest(0, 1800), hidden=lambda s: {0, 1} if s > 0.3 else set())
+    steps = room.run(tracker(TWO), 350)
+    lost = [s.estimate for s in steps if s.estimate and s.estimate.flags & PoseFlags.LOST]
+    assert len(lost) > 50
+    assert {pose(e) for e in lost} == {pose(lost[0])}
+    sigmas = [math.sqrt(e.covariance[0, 0]) for e in lost]
+    assert sigmas == sorted(sigmas)
+    assert sigmas[-1] > 500
+
+
+def test_a_tracker_that_was_carried_away_is_found() -> None:
+    """As if lifted and put down elsewhere within a frame: spikes are where none should be."""
+    jump = 0.6
+    room = Room(NINE, lambda s: (-500.0, 2000.0, 0.0) if s < jump else (400.0, 3200.0, 0.2))
+    steps = room.run(tracker(NINE), 440)
+    late = [s for s in steps if s.t_ns * 1e-9 > jump + 0.9]
+    assert np.abs(room.errors(late)).max(axis=0)[:2].max() < 5
+    wrong = [
+        s
+        for s in steps
+        if s.t_ns * 1e-9 > jump
+        and s.estimate
+        and abs(room.errors([s])[0][0]) > 100
+        and not s.estimate.flags & (PoseFlags.LOST | PoseFlags.PREDICTED | PoseFlags.REJECTED)
+    ]
+    assert not wrong
+
+
+# --- recordings -----------------------------------------------------------------------------------
+
+
+def test_several_leds_from_the_first_frame_on() -> None:
+    """A recording whose frames all have two LEDs lit: they are told apart by their order."""
+    room = Room(TWO, rest(150.0, 2000.0))
+    follower = tracker(TWO)
+    steps = [follower.step(room.frame({0: 60, 1: 60})) for _ in range(30)]
+    assert steps[0].estimate is not None
+    assert np.abs(room.errors(steps)).max(axis=0)[:2].max() < 3
+
+
+def test_frames_without_a_time_follow_each_other() -> None:
+    room = Room(TWO, rest(0.0, 1500.0))
+    follower = tracker(TWO)
+    steps = [follower.step(room.frame({n % 2: 60}, timestamp=None)) for n in range(8)]
+    assert np.diff([s.t_ns for s in steps]).tolist() == [PERIOD] * 7
+    assert steps[-1].estimate is not None
+
+
+def test_a_time_that_runs_back_begins_anew() -> None:
+    room = Room(TWO, rest(0.0, 1500.0))
+    follower = tracker(TWO)
+    room.run(follower, 20)
+    assert follower.locked
+    assert follower.update(room.frame({0: 60}, timestamp=1000)) is None
+    estimate = follower.update(room.frame({1: 60}, timestamp=1000 + PERIOD))
+    assert estimate is not None
+    assert estimate.t_ns == 1000 + PERIOD
+
+
+def test_an_invalid_frame_is_not_measured_on() -> None:
+    room = Room(TWO, rest(0.0, 1500.0))
+    follower = tracker(TWO)
+    room.run(follower, 20)
+    estimate = follower.update(room.frame({0: 60}, flags=FrameFlags.INVALID))
+    assert estimate is not None
+    assert estimate.flags & PoseFlags.PREDICTED
+    assert follower.innovations == ()
+
+
+def test_spikes_that_meet_are_left_out() -> None:
+    """Two LEDs one behind the other, from there: what shows is one spike."""
+    leds = LedMap([0, 1, 2], [[-400.0, 0.0], [0.0, 0.0], [0.0, 600.0]])
+    room = Room(leds, rest(0.0, 2500.0))
+    follower = tracker(leds, heading=Prior(0.0, 0.0))
+    for number in range(12):
+        follower.step(room.frame({number % 3: 60}))
+    step = follower.step(room.frame({0: 60, 1: 60, 2: 60}))
+    assert [i.channel for i in step.innovations] == [0]
+
+
+def test_an_led_that_the_map_lacks_is_an_error() -> None:
+    room = Room(LedMap.line(6, 300.0), rest(0.0, 1500.0))
+    with pytest.raises(ValueError, match=r"is lit by LED 5, and the LED map has 0, 1: .*another"):
+        tracker(TWO).update(room.frame({5: 60}))
+
+
+@pytest.mark.parametrize(
+    ("leds", "options", "message"),
+    [
+        (LedMap([3], [[0.0, 0.0]]), {}, "1 LED in the map: a pose needs two"),
+        (TWO, {"heading": Prior(0.0, 0.1)}, "sigma of heading = 0.1: allowed is 0"),
+        (TWO, {"heading": Prior(0.0, math.inf)}, "two LEDs do not tell the heading"),
+    ],
+)
+def test_what_tells_no_pose_is_refused(leds: LedMap, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        tracker(leds, **options)
+
+
+# --- links ----------------------------------------------------------------------------------------
+
+
+def test_a_replay_gives_the_same_poses() -> None:
+    room = Room(NINE, circle)
+    live = room.run(tracker(NINE), 120)
+    estimates = [s.estimate for s in live if s.estimate]
+    frames = [s.frame for s in live if isinstance(s.frame, Frame)]
+    replayed = list(track(ReplayLink(frames), Calibration(CAMERA, NINE), led_error=0.0))
+    assert len(replayed) == len(estimates) > 80
+    for one, other in zip(replayed, estimates, strict=True):
+        assert pose(one) == pose(other)
+        assert one.flags == other.flags
+        assert np.array_equal(one.covariance, other.covariance)
+
+
+def test_track_ends_with_its_count() -> None:
+    room = Room(TWO, rest(0.0, 1500.0))
+    frames = [room.frame({n % 2: 60}) for n in range(50)]
+    assert len(list(track(ReplayLink(frames), Calibration(CAMERA, TWO), count=20))) == 19
+    some = track(ReplayLink(frames), Calibration(CAMERA, TWO))
+    assert len(list(islice(some, 5))) == 5
+
+
+def test_recordings_are_not_steered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Capture, "send", lambda *_: pytest.fail("a recording cannot change"))
+    room = Room(TWO, rest(0.0, 1500.0))
+    frames = [room.frame({n % 2: 60}) for n in range(50)]
+    assert list(track(ReplayLink(frames), Calibration(CAMERA, TWO)))
+
+
+def test_the_first_command_has_the_schedules_periods() -> None:
+    follower = tracker(NINE, schedule=default_schedule(NINE, 400, 16000))
+    command = first_command(follower, count=7)
+    assert (command.sh_period, command.icg_period, command.count) == (400, 16000, 7)
+    assert command.mode is Mode.STREAM
+    assert all(len(lit) == 1 for lit in command.sequence)  # blind: one by one
+    assert first_command(tracker(NINE)).icg_period == ICG
+
+
+# --- the twin -------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def walk() -> tuple[Any, Calibration]:
+    """A room in which the tracker walks, and what is known of it: the drawing and the plan."""
+    room = load_room("walk")
+    return room, Calibration.nominal(DESIGNS["slit-4mm"], LedMap(*room.known_leds()))
+
+
+@pytest.mark.parametrize(
+    ("spikes", "icg_period", "latest"), [(False, 16000, 8e-3), (True, 14800, 4.8e-3)]
+)
+def test_a_walk_through_the_firmware(
+    walk: tuple[Any, Calibration], spikes: bool, icg_period: int, latest: float
+) -> None:
+    """Followed, in time, and no further off than it says: LEDs stand 0.3 mm off the plan."""
+    room, calibration = walk
+    there = []
+    with TwinLink(room.world, seed=room.seed) as link:
+        schedule = default_schedule(calibration.leds, icg_period=icg_period)
+        follower = Tracker(calibration, schedule=schedule)
+        with Capture(link, first_command(follower, count=150, spikes=spikes)) as capture:
+            steps = []
+            for step in follow(capture, follower):
+                steps.append(step)
+                there.append(link.machine.seconds)
+            assert capture.statistics.good == 150
+            assert capture.statistics.dropped == 0
+        transfers = link.machine.readouts["transfer"] / CLOCK
+    assert isinstance(steps[0].frame, SpikeFrame if spikes else Frame)
+    times = np.array([s.t_ns for s in steps]) * 1e-9
+    ahead = transfers - times[-1]
+    begin = ahead[ahead > 0].min()  # of the device's clock, within a read-out of power-on
+    assert (np.array(there) - begin - times).max() < latest
+    known = [s for s in steps if s.estimate]
+    assert len(known) > 120
+    errors, sigmas = [], []
+    for step in known[20:]:
+        assert step.estimate is not None
+        assert not step.estimate.flags & PoseFlags.LOST
+        true = room.world.pose(begin + step.t_ns * 1e-9)
+        errors.append(np.subtract(pose(step.estimate), (true.x, true.y, true.heading)))
+        sigmas.append(np.sqrt(np.diag(step.estimate.covariance)))
+    assert (np.abs(errors) < 4 * np.array(sigmas)).all()
+    assert (np.abs(errors).max(axis=0) < (12, 4, 4e-3)).all()
+    # once a pose is known, three LEDs a frame, and nearly all of them are found
+    found = [i.outcome for s in known[20:] for i in s.innovations]
+    assert len(found) > 2.5 * len(known[20:])
+    assert np.mean([outcome is Outcome.USED for outcome in found]) > 0.95

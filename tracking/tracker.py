@@ -1,0 +1,586 @@
+"""The tracker: frames in, poses out. It joins spikes, poses, motion and the choice of LEDs.
+
+>>> from acquisition.links import open_link
+>>> from raytransfer.designs import DESIGNS
+>>> from tracking.calibration import Calibration
+>>> from tracking.leds import LedMap
+>>> from tracking.tracker import track
+>>> with open_link("twin") as link:  # doctest: +SKIP
+...     calibration = Calibration.nominal(DESIGNS["thesis"], LedMap.line(2, 500.0))
+...     for estimate in track(link, calibration, count=100):
+...         print(estimate.x, estimate.y)
+"""
+
+from __future__ import annotations
+
+import gc
+import math
+from contextlib import closing, suppress
+from dataclasses import replace
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+
+from acquisition.capture import Capture
+from acquisition.frames import ELEMENTS, MASTER_CLOCK, Frame, FrameFlags
+from acquisition.protocol import ICG_MIN, WINDOW_MIN, Command, Mode
+from raytransfer import TCD1304
+from tracking.motion import MEMORY_NS, Innovation, MotionFilter, Outcome
+from tracking.poses import Estimate, PoseFlags, Prior, locate, optical
+from tracking.scheduling import ExposureControl, PredictedVisible
+from tracking.spikes import MISSING, Spike, SpikeFinder, SpikeFlags
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
+
+    from acquisition.frames import OnboardSpike, SpikeFrame
+    from acquisition.links import Link
+    from tracking.calibration import Calibration
+    from tracking.leds import LedMap
+    from tracking.motion import Expected
+    from tracking.scheduling import Schedule
+    from tracking.spikes import Detector
+
+AHEAD: Final = 4
+"""Frames that a schedule is made for at a time."""
+
+SH_PERIOD: Final = 100
+"""Longest exposure if nothing else is said: 25 µs, as in the thesis; master clocks."""
+
+PER_FRAME: Final = 3
+"""Most LEDs of one frame, if nothing else is said."""
+
+PLACED: Final = 0.5
+"""How well LEDs are where a map has them that nobody has calibrated, mm."""
+
+PEAK: Final = 30_000.0
+"""Height of a spike that exposures aim for, electrons: a third of what fills a pixel."""
+
+_ENTRIES = 14  # of the table that a running capture in spikes mode can change
+_SPEED = 1000.0  # mm/s; what is not known better
+_TURNING = 1.5  # rad/s
+_STROLL = 300.0  # mm/s; while two LEDs are seen one after the other
+_WIDTH = 40.0  # px of a spike that was not seen yet
+_REACH = 1.5  # widths that a spike's light reaches to either side
+_MARGIN = 8.0  # px of background beyond it
+_ODD = SpikeFlags.MISSING | SpikeFlags.CLIPPED | SpikeFlags.DOUBLE
+_USUAL = 1.6  # times the mean width: wider is unusual
+_APART = 1.0  # widths: spikes of one frame that are nearer cannot be told apart
+
+
+class Step(NamedTuple):
+    """What a frame led to.
+
+    Attributes
+    ----------
+    frame : Frame or SpikeFrame
+    t_ns : int
+        Its time: the end of its exposure, device time in ns.
+    estimate : Estimate or None
+        None as long as no pose has ever been known.
+    innovations : tuple of Innovation
+        What each LED lit said beside what was expected.
+    """
+
+    frame: Frame | SpikeFrame
+    t_ns: int
+    estimate: Estimate | None
+    innovations: tuple[Innovation, ...]
+
+    @property
+    def lit(self) -> tuple[int, ...]:
+        """Channels of the LEDs lit."""
+        return self.frame.channels
+
+
+class Tracker:
+    """Follows a tracker from frame to frame.
+
+    As long as no pose is known, LEDs are lit one by one and sought over the whole line; then each
+    is sought where it is expected, and several may be lit at once. When lock is lost it begins
+    again. Everything is compiled when it is made: no frame waits for that.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        At least two LEDs.
+    heading : Prior, optional
+        With sigma 0 it is known and not estimated, which two LEDs need: with two, and left out, it
+        is taken to be 0. An infinite sigma, the default with three or more, leaves it open.
+    height : Prior
+        Of the tracker, mm.
+    detector : {"minimum", "gravity", "derivative", "likelihood"}
+    schedule : Schedule, optional
+        What to light. Left out, a `PredictedVisible` of up to three LEDs a frame, with an SH period
+        of 100 clocks and the shortest ICG period.
+    **motion
+        Further options of `MotionFilter`.
+
+    Attributes
+    ----------
+    innovations : tuple of Innovation
+        Of the last frame.
+
+    Raises
+    ------
+    ValueError
+        There are too few LEDs, or a heading that is neither known nor open.
+    """
+
+    def __init__(
+        self,
+        calibration: Calibration,
+        *,
+        heading: Prior | None = None,
+        height: Prior = Prior(0.0, 0.0),  # noqa: B008  # immutable
+        detector: Detector = "likelihood",
+        schedule: Schedule | None = None,
+        **motion: Any,
+    ) -> None:
+        leds = calibration.leds
+        if len(leds) < 2:
+            raise ValueError(f"{len(leds)} LED in the map: a pose needs two, with a known heading")
+        if heading is None:
+            heading = Prior(0.0, 0.0 if len(leds) == 2 else math.inf)
+        if heading.sigma not in (0, math.inf):
+            raise ValueError(
+                f"sigma of heading = {heading.sigma}: allowed is 0, it is known, or infinity, it "
+                "is measured"
+            )
+        if heading.sigma and len(leds) == 2:
+            raise ValueError("two LEDs do not tell the heading: give one, or a map of three")
+        self._heading = heading if heading.sigma == 0 else None
+        self.calibration = calibration
+        self.leds = leds
+        self.innovations: tuple[Innovation, ...] = ()
+        still = {"angular": 0.0, "turning": 1e-9}  # a heading that is known does not change
+        options = {"speed": _SPEED, "turning": _TURNING, **(still if self._heading else {})}
+        if calibration.covariance is None:
+            options["led_error"] = PLACED
+        self._motion = {"height": height, **options, **motion}
+        self._restart()
+        self._finder = SpikeFinder(calibration.correction, detector=detector)
+        self._warm()
+        self.schedule = default_schedule(leds) if schedule is None else schedule
+        self._widths = dict.fromkeys(leds.channels, _WIDTH)
+        self._t_ns: int | None = None
+        self._told: set[int] = set()  # LEDs of which the schedule has heard since its last plan
+        self._left = 0  # frames until a new sequence is due
+
+    @property
+    def locked(self) -> bool:
+        """Whether the pose is known."""
+        return not self._filter.lost
+
+    @property
+    def losses(self) -> int:
+        """How often lock was lost."""
+        return self._filter.losses
+
+    def update(self, frame: Frame | SpikeFrame) -> Estimate | None:
+        """Take a frame in, and return the pose at the end of its exposure.
+
+        Parameters
+        ----------
+        frame : Frame or SpikeFrame
+            One with `FrameFlags.INVALID` is not measured on.
+
+        Returns
+        -------
+        Estimate or None
+            None as long as no pose has ever been known.
+
+        Raises
+        ------
+        ValueError
+            It was lit by an LED that the map does not have.
+        """
+        if unknown := [n for n in frame.channels if n not in self._widths]:
+            raise ValueError(
+                f"frame {frame.sequence} is lit by LED {unknown[0]}, and the LED map has "
+                f"{', '.join(map(str, self.leds.channels))}: is it that of another room?"
+            )
+        t_ns = self._time(frame)
+        lost = self._filter.lost
+        spikes: dict[int, Spike] = {}
+        if not frame.flags & FrameFlags.INVALID:
+            spikes = self._sought(frame) if lost else self._expected(frame, t_ns)
+        # LEDs go out together: the longest exposure has the earliest middle
+        lit = {n: frame.exposures.get(n, frame.sh_period) for n in spikes}
+        if frame.exposures:
+            # once for each plan: heights are compared with what that plan had expected
+            news = {n: spike for n, spike in spikes.items() if n not in self._told}
+            self.schedule.observe(t_ns, lit, news)
+            self._told.update(news)
+        found = []
+        for channel, clocks in sorted(lit.items(), key=lambda item: -item[1]):
+            middle = t_ns - round(clocks / frame.master_clock * 0.5e9)
+            spike = self._accustomed(channel, spikes[channel])
+            if self._filter.lost and self._heading is not None:
+                found.append(self._keep(middle, channel, spike))
+            else:
+                found.append(self._filter.update(middle, channel, spike))
+            if not spike.flags & _ODD:
+                self._widths[channel] += 0.25 * (spike.width - self._widths[channel])
+        self.innovations = tuple(found)
+        if not found:
+            self._filter.observe(t_ns, {})
+        if self._filter.lost and self._heading is not None:
+            self._fix(t_ns)
+        self._left -= 1
+        if lost != self._filter.lost:
+            self._left = 0
+            self._seen.clear()
+        return self._estimate(t_ns, lost=lost)
+
+    def step(self, frame: Frame | SpikeFrame) -> Step:
+        """As `update`, with what it was based on."""
+        estimate = self.update(frame)
+        assert self._t_ns is not None  # noqa: S101  # set by update
+        return Step(frame, self._t_ns, estimate, self.innovations)
+
+    def sequence(self) -> list[dict[int, int]] | None:
+        """What to light in the next frames: exposure in master clocks by channel, frame by frame.
+
+        Returns
+        -------
+        list of dict, or None
+            None: go on as before.
+        """
+        if self._left > 0:
+            return None
+        self._told.clear()
+        frames = self._left = min(AHEAD, max(1, _ENTRIES // self.schedule.per_frame))
+        return self.schedule.sequence(self._filter, self._t_ns or 0, frames)
+
+    def windows(self, sequence: Sequence[Mapping[int, int]]) -> list[list[tuple[int, int]]]:
+        """Where the microcontroller shall look for the spikes of a `sequence` just planned.
+
+        Returns
+        -------
+        list of list of tuple of int
+            For each frame first and last pixels; an empty list is the whole line.
+        """
+        if self._filter.lost:
+            return [[] for _ in sequence]
+        period = self.schedule.period_ns
+        start = max(self._t_ns or 0, self._filter.t_ns) + (self.schedule.latency + 1) * period
+        result = []
+        for number, lit in enumerate(sequence):
+            # a plan that its successor replaces late is gone through twice
+            times = (start + number * period, start + (number + len(sequence)) * period)
+            found = [self._lit_windows(lit, self._filter.expected(t)) for t in times]
+            both = [(*found[0][n], *found[1][n]) for n in found[0] if n in found[1]]
+            pairs = [(min(w), max(w)) for w in both]
+            result.append([w for w in pairs if w[1] - w[0] >= WINDOW_MIN])
+        return result
+
+    def _warm(self) -> None:
+        """Go once through all that is compiled: a kernel is loaded, or made, when it is called."""
+        self._finder.load_kernels()
+        codes = np.full(ELEMENTS, 3900, np.uint16)
+        codes[2000:2010] = 3000
+        self._finder(Frame(codes))
+        self._finder(Frame(codes), windows=[(1900, 2000)])
+        camera, leds = self.calibration.camera, self.leds
+        x, y = leds.positions[:, 0].mean(), leds.positions[:, 1].max() + 3000.0
+        pixels = camera.project(optical(leds.positions, x, y, 0.0, self._motion["height"].value))
+        seen = [n for n, u in zip(leds.channels, pixels, strict=True) if np.isfinite(u)]
+        motion = MotionFilter(camera, leds, **self._motion)
+        plan = default_schedule(leds)
+        with suppress(ValueError):  # an odd map: it may have no pose there
+            for number in range(4 * len(leds)):
+                at = leds.index(seen[number % len(seen)])
+                spike = Spike(float(pixels[at]), 0.1, 10.0, 1e4)
+                motion.update(number * plan.period_ns, leds.channels[at], spike)
+            places = [leds.index(n) for n in seen]
+            known = Prior(0.0, 0.0)
+            locate(
+                camera,
+                leds.positions[places],
+                pixels[places],
+                0.1 + 0 * pixels[places],
+                heading=known,
+            )
+        for lost in (False, True):
+            motion.lost, motion.losses = lost, 1
+            plan.sequence(motion, motion.t_ns, AHEAD)
+            motion.estimate(motion.t_ns + 1)
+            motion.expected(motion.t_ns + 1)
+        gc.collect()  # compiling leaves much behind: clear it away now, not between two frames
+
+    def _restart(self) -> None:
+        self._filter = MotionFilter(self.calibration.camera, self.leds, **self._motion)
+        self._seen: dict[int, tuple[int, Spike]] = {}  # latest, while lock is lost
+        self._last: Estimate | None = None  # that was known
+        self._fresh = PoseFlags.NONE  # of a pose just found
+
+    def _time(self, frame: Frame | SpikeFrame) -> int:
+        """End of the exposure, ns; of frames without a time, one read-out after the other."""
+        before = self._t_ns
+        if frame.timestamp is not None:
+            self._t_ns = frame.timestamp
+        else:
+            clocks = frame.icg_period or ICG_MIN
+            self._t_ns = (before or 0) + round(clocks / frame.master_clock * 1e9)
+        if before is not None and self._t_ns < before:
+            self._restart()  # another recording
+        return self._t_ns
+
+    def _sought(self, frame: Frame | SpikeFrame) -> dict[int, Spike]:
+        """Spikes of the whole line: the strongest, as many as LEDs are lit.
+
+        Several at once are told apart by their order only: LEDs of a line, seen from its front,
+        have that of their x.
+        """
+        channels = frame.channels
+        if not channels:
+            return {}
+        found = self._whole_line(frame)[: len(channels)]
+        if len(channels) == 1:
+            return {channels[0]: found[0] if found else MISSING}
+        if len(found) < len(channels):
+            return {}
+        turned = self.calibration.camera.scale < 0
+        along = sorted(channels, key=lambda n: self.leds.positions[self.leds.index(n), 0])
+        spikes = sorted(found, key=lambda spike: spike.position, reverse=turned)
+        return dict(zip(along, spikes, strict=True))
+
+    def _expected(self, frame: Frame | SpikeFrame, t_ns: int) -> dict[int, Spike]:
+        """Spikes of the LEDs lit, each where it should be."""
+        expected = self._filter.expected(max(t_ns, self._filter.t_ns))
+        windows = self._lit_windows(frame.channels, expected)
+        if isinstance(frame, Frame):
+            spikes = self._finder(frame, windows=list(windows.values()))
+            return dict(zip(windows, spikes, strict=True))
+        found = self._whole_line(frame)
+        return {
+            channel: next((s for s in found if first <= s.position <= last), MISSING)
+            for channel, (first, last) in windows.items()
+        }
+
+    def _accustomed(self, channel: int, spike: Spike) -> Spike:
+        """Forgive a double peak to a spike no wider than this LED's are: it is the head's caustic.
+
+        LEDs that would meet are not looked for at once, so that a second one does not hide here.
+        """
+        if spike.flags & SpikeFlags.DOUBLE and spike.width < _USUAL * self._widths[channel]:
+            return replace(spike, flags=spike.flags & ~SpikeFlags.DOUBLE)
+        return spike
+
+    def _whole_line(self, frame: Frame | SpikeFrame) -> list[Spike]:
+        """All spikes, the strongest first."""
+        if isinstance(frame, Frame):
+            return self._finder(frame)
+        gain, noise = self._finder.correction.electrons_per_code, self._finder.correction.read_noise
+        found = [_from_device(s, gain, noise, self._unevenness) for s in frame.spikes]
+        return sorted(found, key=lambda spike: -spike.height)
+
+    def _lit_windows(self, lit: Collection[int], expected: Expected) -> dict[int, tuple[int, int]]:
+        """First and last pixel by channel; LEDs that cannot be told apart are left out."""
+        pixels, sigmas = expected.pixels, expected.sigmas
+        rows = [row for row in map(self.leds.index, lit) if expected.visible[row]]
+        rows.sort(key=pixels.__getitem__)
+        widths = [self._widths[self.leds.channels[row]] for row in rows]
+        reach = [
+            _REACH * w + _MARGIN + 5 * sigmas[row] for w, row in zip(widths, rows, strict=True)
+        ]
+        low = [pixels[row] - r for row, r in zip(rows, reach, strict=True)]
+        high = [pixels[row] + r for row, r in zip(rows, reach, strict=True)]
+        mixed = set()
+        for (i, row), (j, other) in pairwise(enumerate(rows)):
+            gap = pixels[other] - pixels[row]
+            if gap < _APART * (widths[i] + widths[j]) + 3 * (sigmas[row] + sigmas[other]):
+                mixed |= {i, j}
+            border = (pixels[row] + pixels[other]) / 2
+            high[i], low[j] = min(high[i], border), max(low[j], border)
+        last = TCD1304.pixels - 1
+        return {
+            self.leds.channels[row]: (max(math.floor(low[i]), 0), min(math.ceil(high[i]), last))
+            for i, row in enumerate(rows)
+            if i not in mixed
+        }
+
+    @property
+    def _unevenness(self) -> float:
+        """Of pixels, which the microcontroller does not correct."""
+        response = self._finder.correction.response
+        return max(float(response.std()), self._finder.correction.uncertainty)
+
+    def _keep(self, t_ns: int, channel: int, spike: Spike) -> Innovation:
+        if spike.found:
+            self._seen[channel] = t_ns, spike
+        outcome = Outcome.KEPT if spike.found else Outcome.MISSING
+        return Innovation(t_ns, channel, math.nan, math.nan, math.inf, outcome)
+
+    def _fix(self, t_ns: int) -> None:
+        """Seek a pose of known heading in the latest spike of each LED."""
+        assert self._heading is not None  # noqa: S101  # as the caller has asked
+        recent = {n: kept for n, kept in self._seen.items() if t_ns - kept[0] <= MEMORY_NS}
+        if len(recent) < 2:
+            return
+        camera = self.calibration.camera
+        smear = abs(camera.scale) * _STROLL / 1000  # px/s, seen from a metre
+        ages = np.array([t_ns - at for at, _ in recent.values()]) * 1e-9
+        sigmas = np.array([spike.sigma for _, spike in recent.values()])
+        fix = locate(
+            camera,
+            self.leds.positions[[self.leds.index(n) for n in recent]],
+            np.array([spike.position for _, spike in recent.values()]),
+            np.sqrt(sigmas**2 + (3 * camera.model_error) ** 2 + (smear * ages) ** 2),
+            heading=self._heading,
+            height=self._motion["height"],
+        )
+        limit = fix.degrees + 4 * math.sqrt(2 * max(fix.degrees, 0))
+        if not np.isfinite(fix.covariance).all() or fix.flags & PoseFlags.AMBIGUOUS:
+            return
+        if fix.degrees > 0 and fix.chi2 > limit:
+            return
+        self._filter.start(fix, t_ns)
+        self._fresh = fix.flags
+
+    def _estimate(self, t_ns: int, *, lost: bool) -> Estimate | None:
+        """The pose at the end of a frame, in which lock was lost at its beginning or not."""
+        flags = PoseFlags.NONE if self._heading is None else PoseFlags.HEADING_ASSUMED
+        if self._filter.lost:
+            if self._last is None:
+                return None
+            seconds = (t_ns - self._last.t_ns) * 1e-9
+            rates = np.array([_SPEED, _SPEED, 0.0 if self._heading else _TURNING])
+            covariance = self._last.covariance + np.diag((rates * seconds) ** 2)
+            return replace(
+                self._last, t_ns=t_ns, covariance=covariance, flags=flags | PoseFlags.LOST
+            )
+        # of all LEDs of the frame; the filter's own flags are those of the last one
+        outcomes = {found.outcome for found in self.innovations}
+        flags |= self._filter.estimate().flags & PoseFlags.INCONSISTENT | self._fresh
+        self._fresh = PoseFlags.NONE
+        if Outcome.REJECTED in outcomes:
+            flags |= PoseFlags.REJECTED
+        if lost and self._last is not None:
+            flags |= PoseFlags.RELOCALISED
+        if not lost and Outcome.USED not in outcomes:
+            flags |= PoseFlags.PREDICTED
+        now = replace(self._filter.estimate(max(t_ns, self._filter.t_ns)), flags=flags)
+        if self._heading is not None:  # rounding aside it has not changed
+            now.covariance[2] = now.covariance[:, 2] = 0.0
+            now = replace(now, heading=self._heading.value)
+        self._last = now
+        return now
+
+
+def _from_device(found: OnboardSpike, gain: float, noise: float, uneven: float) -> Spike:
+    """A spike that the microcontroller found, with the error that one of its size has.
+
+    Of a Gaussian with standard deviation s and height h: photons give s²/(√(2π) s h), read noise r
+    gives 2 s r²/(√π h²), uneven pixels u² s/(4 √π); the filter needs 1.15 times the root.
+    """
+    height, s = found.height * gain, max(found.width, 1.0) / 2.3548
+    if height <= 0:
+        return MISSING
+    variance = s / (2.5066 * height) + 1.1284 * s * (noise / height) ** 2 + 0.1410 * s * uneven**2
+    sigma = 1.15 * math.sqrt(variance)
+    return Spike(found.position, sigma, found.width, height, SpikeFlags(found.flags))
+
+
+def default_schedule(
+    leds: LedMap, sh_period: int = SH_PERIOD, icg_period: int | None = None
+) -> Schedule:
+    """Up to `PER_FRAME` LEDs a frame, those that should be seen.
+
+    Parameters
+    ----------
+    leds : LedMap
+    sh_period : int
+        The longest exposure, master clocks.
+    icg_period : int, optional
+        From frame to frame, master clocks; the shortest possible when left out.
+
+    Raises
+    ------
+    CommandError
+        The periods are not possible.
+    """
+    if icg_period is None:
+        icg_period = -(-ICG_MIN // sh_period) * sh_period if sh_period > 0 else ICG_MIN
+    return PredictedVisible(
+        leds,
+        sh_period,
+        icg_period,
+        exposure=ExposureControl(leds, sh_period, peak=PEAK),
+        per_frame=min(len(leds), PER_FRAME),
+    )
+
+
+def first_command(tracker: Tracker, *, count: int = 0, spikes: bool = False) -> Command:
+    """The command that a capture for `follow` begins with.
+
+    Parameters
+    ----------
+    tracker : Tracker
+    count : int
+        Frames; 0 is without end.
+    spikes : bool
+        Whether the microcontroller finds the spikes.
+    """
+    schedule = tracker.schedule
+    mode = Mode.SPIKES if spikes else Mode.STREAM
+    sequence = tracker.sequence() or ()  # while lock is lost, spikes are sought on the whole line
+    icg_period = round(schedule.period_ns * MASTER_CLOCK * 1e-9)
+    return Command(schedule.sh_period, icg_period, count, mode, sequence)
+
+
+def follow(capture: Capture, tracker: Tracker, *, steer: bool = True) -> Generator[Step]:
+    """Yield what each frame of a running capture leads to.
+
+    Parameters
+    ----------
+    capture : Capture
+        In stream or spikes mode; from `first_command` where it is to be steered.
+    tracker : Tracker
+    steer : bool
+        Send what the tracker wants lit next. Not for recordings: their LEDs are what they are.
+
+    Yields
+    ------
+    Step
+        One for each frame; the first ones without a pose.
+    """
+    for frame in capture:
+        step = tracker.step(frame)
+        if steer and (wanted := tracker.sequence()) is not None:
+            if capture.command.mode is Mode.SPIKES:
+                windows = tracker.windows(wanted)
+                capture.send(replace(capture.command, sequence=wanted, windows=windows))
+            else:
+                capture.send(wanted)
+        yield step
+
+
+def track(
+    link: Link, calibration: Calibration, *, count: int = 0, spikes: bool = False, **options: Any
+) -> Iterator[Estimate]:
+    """Yield a pose for each frame from a link, once the first one is known.
+
+    Parameters
+    ----------
+    link : Link
+        Stays open. A recording is followed with the LEDs that it was made with.
+    calibration : Calibration
+    count, spikes
+        As for `first_command`.
+    **options
+        As for `Tracker`.
+
+    Yields
+    ------
+    Estimate
+    """
+    tracker = Tracker(calibration, **options)
+    command = first_command(tracker, count=count, spikes=spikes)
+    steer = not hasattr(link, "recorded")
+    with Capture(link, command) as capture, closing(follow(capture, tracker, steer=steer)) as steps:
+        for step in steps:
+            if step.estimate is not None:
+                yield step.estimate
