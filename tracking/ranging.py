@@ -129,8 +129,9 @@ class Place(NamedTuple):
 class RangeFinder:
     """Distance of an LED from the width of its spike.
 
-    All distances within a table are taken as equally probable beforehand; what is expected comes on
-    top. The result is the mean and the standard deviation of what the width leaves.
+    All distances within a table are taken as equally probable beforehand, and none beyond; what is
+    expected comes on top. The result is the mean and the standard deviation of what the width
+    leaves. Where that reaches the farthest distance, σ is as small as the table's end makes it.
 
     Parameters
     ----------
@@ -201,10 +202,14 @@ class RangeFinder:
         distances: ArrayLike | None = None,
         half_field: float = 0.42,
         tolerances: Tolerances | None = None,
-        heads: int = 6,
+        heads: int = 24,
         seed: int = 0,
     ) -> Self:
         """Widths of a head as drawn, in exact light; how sure they are, from heads as made.
+
+        The spread is the root mean square of `heads` deviations from the drawing. From so few it is
+        itself not well known: it is taken times √(N / (N − 2)), the standard deviation of Student's
+        distribution with N degrees of freedom, which is what the next head then follows.
 
         Parameters
         ----------
@@ -226,29 +231,33 @@ class RangeFinder:
             `Tolerances()` when left out, which describes a printed mount: with it the widths of a
             head that was never measured say little.
         heads : int
-            So many are drawn.
+            So many are drawn, 3 or more. With 24 the spread is known to about 12 %.
         seed : int
 
         Raises
         ------
         ValueError
-            If an LED within the field leaves no spike on the line.
+            If an LED within the field leaves no spike on the line, or there are too few heads.
         """
         finder = SpikeFinder() if finder is None else finder
         tolerances = Tolerances() if tolerances is None else tolerances
         at = 1 / np.linspace(1 / 300, 1 / 6000, 16) if distances is None else distances
         at = check.positive_array("distances", at, "mm")
         aside = np.linspace(-1, 1, 7) * check.positive("half_field", half_field, "a tangent")
-        draws = np.random.SeedSequence(seed).spawn(check.whole("heads", heads))
+        if check.whole("heads", heads) < 3:
+            raise ValueError(f"heads = {heads}: of fewer than 3 no spread is known")
+        draws = np.random.SeedSequence(seed).spawn(heads)
         made = [perturb(system, tolerances, np.random.default_rng(draw)) for draw in draws]
 
-        def widths(of: OpticalSystem) -> list[list[float]]:
+        def widths(of: OpticalSystem, columns: NDArray[np.float64]) -> NDArray[np.float64]:
             width = partial(_width, of, camera, finder, sensor, wavelength, extent)
-            return [[width(d, m) for m in aside.tolist()] for d in at.tolist()]
+            return np.array([[width(d, m) for m in columns.tolist()] for d in at.tolist()])
 
-        drawn = np.array(widths(system))
-        others = np.array([widths(head) for head in made])
-        spread = np.sqrt(np.mean((others - drawn) ** 2, axis=0))
+        drawn = widths(system, aside)
+        few = slice(None, None, 2)  # across the field spreads change less than widths
+        off = np.array([widths(head, aside[few]) for head in made]) - drawn[:, few]
+        some = np.sqrt(np.sum(off**2, axis=0) / (heads - 2))
+        spread = np.array([np.interp(aside, aside[few], row) for row in some])
         return cls(camera, at, aside, drawn, np.hypot(spread, 0.01 * drawn))
 
     @classmethod
@@ -440,9 +449,10 @@ class RangeFinder:
         return Place(x, y, changes.T @ changes, found)
 
     def useful(self, tangent: float = 0.0, sigma: float = 0.05) -> NDArray[np.bool_]:
-        """Whether widths tell distances, at each of `distances`: σ within `RELATIVE_LIMIT`.
+        """Whether a width alone tells the distance, at each of `distances`.
 
-        Both sides of the focus count as told apart.
+        It does where σ of the spike's `Range` is within `RELATIVE_LIMIT` of the distance. Where the
+        other side of the focus explains the width as well, it does not.
 
         Parameters
         ----------
@@ -451,10 +461,14 @@ class RangeFinder:
         sigma : float
             Of the spike's position, px.
         """
-        width, error = self._at(tangent)
-        slope = np.abs(np.gradient(width, self.distances))
+        width, error = self._at(check.number("tangent", tangent))
         error = np.hypot(error, WIDTH_NOISE * check.not_negative("sigma", sigma, "px"))
-        return np.asarray(error < RELATIVE_LIMIT * self.distances * slope)
+        told = []
+        for seen in width:
+            density = self._share * np.exp(-0.5 * ((width - seen) / error) ** 2) / error
+            distance, found = _moments(self.distances, density / density.sum())
+            told.append(found <= RELATIVE_LIMIT * distance)
+        return np.array(told)
 
     def _at(self, tangent: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Widths and their σ over all distances in a direction."""

@@ -45,6 +45,7 @@ def test_wheel_captures_with_the_twin(tmp_path: Path) -> None:
     names = zipfile.ZipFile(wheel).namelist()
     for machine in ("x86_64", "aarch64"):
         assert f"twin/core/build/libtwin-{machine}.so" in names
+    assert {"tracking/cli.py", "twin/data/walk.toml"} <= set(names)
     assert not any(name.startswith(("tests/", "notebooks/")) for name in names)
     installed = tmp_path / "installed"
     zipfile.ZipFile(wheel).extractall(installed)
