@@ -25,7 +25,10 @@ POSITION, SIGMA, WIDTH, HEIGHT, FLAGS, COLUMNS = range(6)
 BIN = 4  # px; even, so that a difference between odd and even pixels cancels
 SCALES = 7  # widths of the search: 4 to 256 px
 NOISIER = 1.15  # times what is stated
-LONELY = 4.0  # times its neighbours that a pixel may have: 2.7 in a spike of 1.5 px
+LONELY = (
+    4.0  # times its neighbours that a pixel has before it is looked at: 2.7 in a spike of 1.5 px
+)
+SPILL = 0.03  # of its light that an LED in sharp focus leaves beside a pixel, a hot one not
 WANDER = 0.35  # of the read noise: what a dark line's slow structure may be
 WIDEST = 320.0  # px; what is wider is no spike of an LED
 LEVEL = 0.5  # of the height, where the width is measured
@@ -38,11 +41,17 @@ MISFIT = 5.0  # standard deviations by which chi-square may exceed its mean
 SECOND = 0.5  # of the height: a second peak above is another LED, below a reflection
 OVERLAP = 2.0  # widths between two spikes below which they are fitted together
 VAGUE = 0.25  # widths that a position may be uncertain by
+PIXEL = (
+    0.3  # px that a position may be uncertain by in any case: it is in a pixel, or in one of two
+)
+COARSE = 3.0  # px: a narrower spike is not resolved
 STEEP = 0.02  # px by which the steep sides of a spike without its top shift as they cross pixels
-GAP = 0.12  # of the height: two peaks with less light between them are two spikes
+GAP = 0.09  # of the height: two peaks with less light between them are two spikes
+HORNS = 96  # px: a caustic's horns are no farther apart
 SHOULDER = 0.6  # of the height by which the light may differ on both sides
 FALLEN = 0.9  # of the height, at the end of the line
 DIP = 0.6  # of the height: two peaks are two if it is darker between them
+NARROWER = 0.4  # of the outline's width: a fit below is not of that spike
 WEAKEST = 0.01  # of the height: what is smaller is no second peak but the spike's own shape
 
 
@@ -56,8 +65,9 @@ def convert(elements, pattern, gain, inverse, settings, electrons, variance, ful
     dark = np.sort(elements[16:29])
     reference = float(dark[6])
     read, saturation, doubt = settings[0], settings[1], settings[2]
+    codes = elements[32 : 32 + electrons.size]
     for i in range(electrons.size):
-        code = elements[32 + i]
+        code = codes[i]
         below = reference - code
         full[i] = (below >= saturation) | (code == 0)
         light = (below - pattern[i]) * gain[i]
@@ -67,17 +77,35 @@ def convert(elements, pattern, gain, inverse, settings, electrons, variance, ful
 
 @_compile
 def _heal(electrons, variance):
-    """Replace pixels that are far above both neighbours, as no head's light can be: hot ones."""
-    last = electrons.size - 1
-    found = np.empty(electrons.size, np.bool_)
-    for i in range(2, last - 1):
-        beside = max(electrons[i - 1], electrons[i + 1])
-        low = min(min(electrons[i - 2], electrons[i + 2]), beside)
-        over = electrons[i] - low - LONELY * (beside - low)
-        found[i] = (over > 0.0) & (over * over > 64.0 * variance[i])
-    for i in range(2, last - 1):
-        if found[i]:
-            electrons[i] = 0.5 * (electrons[i - 1] + electrons[i + 1])
+    """Replace hot pixels: far above both neighbours, which are as if it were not there.
+
+    An LED in sharp focus leaves light beside its pixel, on one side at least.
+    """
+    count = electrons.size - 4
+    # slices, not places beside: the compiler then makes vectors of it
+    one, two, at, four, five = (
+        electrons[:count], electrons[1:], electrons[2:], electrons[3:], electrons[4:]
+    )  # fmt: skip
+    spread = variance[2:]
+    hot = 0
+    found = np.empty(max(count, 0), np.bool_)
+    for k in range(count):
+        beside = max(two[k], four[k])
+        low = min(min(one[k], five[k]), beside)
+        over = at[k] - low - LONELY * (beside - low)
+        found[k] = (over > 0.0) & (over * over > 64.0 * spread[k])
+        hot += found[k]
+    if not hot:
+        return
+    for i in range(2, count + 2):
+        if found[i - 2]:
+            before, after = electrons[i - 1], electrons[i + 1]
+            before2, after2 = electrons[i - 2], electrons[i + 2]
+            step = abs(after - before - 0.5 * (after2 - before2))
+            spilled = max(step, 0.5 * (before + after - before2 - after2))
+            noise = math.sqrt(variance[i - 1] + variance[i + 1])
+            if spilled < max(SPILL * (electrons[i] - min(before, after)), 4.0 * noise):
+                electrons[i] = 0.5 * (before + after)
 
 
 @_compile
@@ -103,7 +131,7 @@ def _noise(total, spread, first, bins, limit):
 
 @_compile
 def _scan(total, spread, first, bins, wander, scores):
-    """Significance of light at places and scales over what is beside it.
+    """Significance of light at places and scales over what is beside it, squared with its sign.
 
     `total` and `spread` are running sums of electrons and variance. Row n of `scores` is for a
     width of BIN 2^n pixels, in steps of `_step(n)` bins. `wander` is the variance of what does not
@@ -132,8 +160,9 @@ def _scan(total, spread, first, bins, wander, scores):
             )
             excess = centre - 0.5 * beside
             own = noise[j + wide] - noise[j] + floor
+            around = own + 0.25 * around
             # beside what is darker than dark, as of an inverted output, nothing is light
-            scores[n, k] = min(excess / math.sqrt(own + 0.25 * around), centre / math.sqrt(own))
+            scores[n, k] = min(excess * abs(excess) / around, centre * abs(centre) / own)
         for k in range(count):
             if start <= k < stop:
                 continue
@@ -151,7 +180,7 @@ def _scan(total, spread, first, bins, wander, scores):
                     around += (noise[b] - noise[a]) * part * part
                     sides += 1
             excess = centre - beside / max(sides, 1)
-            score = min(excess / math.sqrt(around), centre / math.sqrt(own))
+            score = min(excess * abs(excess) / around, centre * abs(centre) / own)
             scores[n, k] = score if sides else -1.0
 
 
@@ -198,6 +227,25 @@ def _crossing(total, first, last, start, direction, level, smooth, furthest):
 
 
 @_compile
+def _outermost(total, first, last, peak, direction, level, floor, gap, smooth, furthest):
+    """The outermost pixel above a level: of a caustic's second horn, but not over a gap."""
+    outer = peak
+    for k in range(1, furthest + 1):
+        i = peak + direction * k
+        if i < first or i > last:
+            break
+        if _mean(total, first, last, i, smooth) >= level:
+            between = abs(i - outer) - 1
+            half = between // 4
+            if between > 2 and _mean(total, first, last, (i + outer) // 2, half) < floor + gap:
+                break
+            outer = i
+        elif _mean(total, first, last, i, max(smooth, 2)) < floor + 0.4 * gap:
+            break
+    return outer
+
+
+@_compile
 def _outline(total, first, last, centre, scale, shape):
     """Measure background, height and half-maximum places of what is at a place.
 
@@ -239,20 +287,11 @@ def _outline(total, first, last, centre, scale, shape):
             base = min(before, after)
             height = peak - base
         level = base + LEVEL * height
-        # a caustic's second horn is beyond a dip: go to the outermost pixel above, but not over a gap
-        low = high = at
-        for i in range(at - 1, max(centre_px - reach, first) - 1, -1):
-            value = _mean(total, first, last, i, smooth)
-            if value < base + GAP * height:
-                break
-            if value >= level:
-                low = i
-        for i in range(at + 1, min(centre_px + reach, last) + 1):
-            value = _mean(total, first, last, i, smooth)
-            if value < base + GAP * height:
-                break
-            if value >= level:
-                high = i
+        # the background beside one horn may be the light between both
+        floor, gap = min(base, min(before, after)), GAP * height
+        reach = max(reach, HORNS)
+        low = _outermost(total, first, last, at, -1, level, floor, gap, smooth, reach)
+        high = _outermost(total, first, last, at, 1, level, floor, gap, smooth, reach)
         furthest = int(WIDEST)
         left = _crossing(total, first, last, low, -1, level, smooth, furthest)
         right = _crossing(total, first, last, high, 1, level, smooth, furthest)
@@ -602,6 +641,37 @@ def _beside(cells, origin, size, model, place, width, out):
 
 
 @_compile
+def _horns(electrons, variance, first, last, shape, out):
+    """Find a caustic's two horns in an outline: their places, mean height, what is between them."""
+    base, left, right = shape[0], shape[2], shape[3]
+    low, high = max(math.floor(left), first), min(math.ceil(right), last)
+    middle = (low + high) // 2
+    one, other = low, high
+    for i in range(low, middle + 1):
+        if electrons[i] > electrons[one]:
+            one = i
+    for i in range(middle, high + 1):
+        if electrons[i] > electrons[other]:
+            other = i
+    between = other - one
+    if 2 * between < high - low or between < 3:
+        return False
+    light = noise = 0.0
+    a, b = one + (between + 2) // 4, other - (between + 2) // 4
+    for i in range(a, b + 1):
+        light += electrons[i]
+        noise += variance[i]
+    light, noise = light / (b - a + 1), math.sqrt(noise) / (b - a + 1)
+    least = min(electrons[one], electrons[other]) - base
+    out[0], out[1] = one, other
+    out[2] = 0.5 * (electrons[one] + electrons[other]) - base
+    out[3] = max(light - base, 0.0)
+    # peaks of noise alone are not so high
+    doubt = 3.0 * math.sqrt(max(variance[one], variance[other])) + noise
+    return light - base < min(DIP * least, least - doubt)
+
+
+@_compile
 def _likelihood(electrons, variance, full, first, last, shape, beside, threshold, out):
     """Maximum likelihood of one spike whose outline is known. Returns whether it came to a result.
 
@@ -613,9 +683,12 @@ def _likelihood(electrons, variance, full, first, last, shape, beside, threshold
     width = right - left
     q, best = np.zeros(PARAMETERS), np.zeros(PARAMETERS)
     chi = spread = np.nan
-    chosen = -1
-    bump = np.zeros(3)
+    chosen, fitted = -1, 0
+    bump, horns = np.zeros(3), np.zeros(4)
     known = beside[0] > 0.0
+    horned = _horns(electrons, variance, max(first, 0), last, shape, horns)
+    if known and horned:
+        return False
     group = max(int(width / GROUPS), 1)
     for i in range(first, last + 1):
         if full[i]:
@@ -623,8 +696,9 @@ def _likelihood(electrons, variance, full, first, last, shape, beside, threshold
             break
     cells, model = np.empty((3, 1)), np.empty(1)
     origin, lit = 0.0, 0
-    for stage in range(3):
-        if stage == 0 or (stage == 2 and group > 1):
+    # horns are no Gaussian, even where light is too weak to tell
+    for stage in range(2 if horned else 0, 3 if not horned else 4):
+        if cells.shape[1] == 1 or (stage == 2 and group > 1):
             if stage == 2:
                 group = 1
             n = (last - first + 1) // group
@@ -652,14 +726,22 @@ def _likelihood(electrons, variance, full, first, last, shape, beside, threshold
             if not (bump[0] > threshold and bump[2] > WEAKEST * q[BELL]):
                 continue
             q[BELL2], q[PLACE2] = 2.0 * bump[2], bump[1]  # the first took part of it
+        elif stage == 2 and horned:
+            # of the outer side from the top to the half: what a bell has
+            soft = 0.5 * ((horns[0] - left) + (right - horns[1])) * 2.0 / PEAK
+            q[BELL], q[FLOOR] = max(horns[2] - 0.5 * horns[3], 0.2 * height), horns[3]
+            q[SOFT], q[APART] = math.log(max(soft, 0.4)), horns[1] - horns[0]
+            q[PLACE], q[BASE], q[SLOPE] = 0.5 * (horns[0] + horns[1]), base, 0.0
         else:
-            if width < 3.5 or chosen == 1:
+            if width < 3.5 or (horned and chosen > 0):
                 break
             q[BELL], q[FLOOR] = 0.2 * height, 0.7 * height
             q[SOFT], q[APART] = math.log(max(0.12 * width, 0.6)), 0.85 * width
             q[PLACE], q[BASE], q[SLOPE] = 0.5 * (left + right), base, 0.0
-        result, certain = _fit(cells, origin, group, q, stage == 2, known or stage == 1, model)
+        result, certain = _fit(cells, origin, group, q, stage >= 2, known or stage == 1, model)
         if not certain > 0.0:
+            if horned and stage == 2:
+                continue
             if known and stage == 0:
                 return False
             break
@@ -670,11 +752,20 @@ def _likelihood(electrons, variance, full, first, last, shape, beside, threshold
             and first <= q[PLACE2] <= last
         ):
             continue
-        best[:] = q
-        chi, spread, chosen = result, certain, stage
         n = model.size
+        if chosen == 1 and result - n > chi - fitted:  # of two that do not fit the better
+            break
+        best[:] = q
+        chi, spread, chosen, fitted = result, certain, min(stage, 2), n
         if lit or known or chi < n + MISFIT * math.sqrt(2.0 * n):
             break
+    # where no shape fits, pixels too coarse for it move the place, or noise chooses between two fits
+    excess = chi - fitted - MISFIT * math.sqrt(2.0 * fitted)
+    if not lit and excess > 0.0:
+        if width < COARSE:
+            spread *= 1.0 + excess / (2.0 * width + 4.0)
+        elif chosen == 1:
+            spread *= 2.0
     place = best[PLACE]
     if chosen < 0 or not first - 0.5 <= place <= last + 0.5:
         return False
@@ -691,6 +782,9 @@ def _likelihood(electrons, variance, full, first, last, shape, beside, threshold
         if middle < DIP * extent[1]:
             flags = DOUBLE
     if not (extent[1] > 0.0 and extent[0] > 0.0):
+        return False
+    # one horn alone, or what else is not what was seen
+    if not (lit or known) and extent[0] < NARROWER * width:
         return False
     out[POSITION], out[SIGMA] = place, math.sqrt(spread)
     out[WIDTH], out[HEIGHT], out[FLAGS] = extent[0], extent[1], flags
@@ -823,6 +917,23 @@ def _minimum(electrons, variance, first, last, total, shape, out):
     return True
 
 
+@_compile
+def _within(electrons, first, last, base, place):
+    """Standard deviation of a place within its pixel, px, where that pixel has nearly all light.
+
+    Light that is no wider than a pixel and leaves a part s in the next one has its middle between s
+    and the border, at 0.5, and nothing tells where. Light on both sides does.
+    """
+    i = min(max(round(place), first), last)
+    before = max(electrons[i - 1] - base, 0.0) if i > first else 0.0
+    after = max(electrons[i + 1] - base, 0.0) if i < last else 0.0
+    light = max(electrons[i] - base, 0.0) + before + after
+    if not light > 0.0:
+        return 0.0
+    alone = max(1.0 - 2.0 * (before + after) / light, 0.0)
+    return alone * max(1.0 - 10.0 * min(before, after) / light, 0.0) / math.sqrt(12.0)
+
+
 # --- all together --------------------------------------------------------------------------------
 
 
@@ -842,7 +953,7 @@ def _search(electrons, variance, full, total, spread, first, last, limit, kind, 
     ends = np.empty(most, np.int64)
     found = 0
     for _ in range(4 * most):
-        top, n_top, k_top = threshold, -1, -1
+        top, n_top, k_top = threshold * threshold, -1, -1
         for n in range(scales):
             for k in range(_places(bins, n)):
                 if scores[n, k] > top:
@@ -920,15 +1031,26 @@ def _search(electrons, variance, full, total, spread, first, last, limit, kind, 
                     )
                     a, b = c, d
                     beside[:] = 0.0
+            # of one pixel's light no shape can be fitted
+            if done and width < COARSE and not 0.0 < row[SIGMA] < VAGUE * row[WIDTH]:
+                done = False
         elif kind == DERIVATIVE:
             done = _derivative(electrons, variance, c, d, shape, row)
         elif kind == MINIMUM:
             done = _minimum(electrons, variance, c, d, total, shape, row)
         if not done:
+            row[WIDTH], row[HEIGHT], row[FLAGS] = width, shape[1], 0.0
             done = _gravity(electrons, variance, c, d, total, shape, fraction, row)
         # a broad spectrum, or too little light
-        if not (done and 0.0 < row[SIGMA] < VAGUE * row[WIDTH] and row[WIDTH] < WIDEST):
+        vague = max(VAGUE * row[WIDTH], 2.0 * PIXEL if kind == MINIMUM else PIXEL)
+        if not (done and 0.0 < row[SIGMA] < vague and row[WIDTH] < WIDEST):
             continue
+        if width < COARSE:
+            if kind != MINIMUM:
+                within = _within(electrons, c, d, shape[0], row[POSITION])
+                row[SIGMA] = math.hypot(row[SIGMA], within)
+            if row[WIDTH] < 1.0:
+                row[WIDTH], row[HEIGHT] = 1.0, shape[1]
         flags = int(row[FLAGS])
         for i in range(max(int(shape[2]), first), min(int(shape[3]) + 1, last) + 1):
             if full[i]:
@@ -968,7 +1090,8 @@ def find(
                 electrons[i] -= electrons2[i]
                 variance[i] += variance2[i]
                 full[i] |= full2[i]
-    _heal(electrons, variance)
+        elif settings[5] == 0.0:
+            _heal(electrons, variance)
     total, spread = np.empty(size + 1), np.empty(size + 1)
     total[0] = spread[0] = 0.0
     for i in range(size):

@@ -380,14 +380,19 @@ class SpikeFinder:
     """Finds the spikes of a frame.
 
     All detectors get the same places, found by the significance of light over what is beside it, at
-    widths from 4 to 256 px: one pixel alone, a step or a broad spectrum is no spike. They differ in
-    how the position is read. `minimum` is the thesis's pixel with the lowest code. `gravity` is the
+    widths from 4 to 256 px: a step or a broad spectrum is no spike. Two peaks with light between
+    them are a caustic's horns, and one spike. They differ in how the position is read. `minimum` is the thesis's pixel with the lowest code. `gravity` is the
     centre of gravity of what is above a tenth of the height. `derivative` is where the light has no
     slope once it is smoothed by a Gaussian of 0.35 widths. `likelihood` fits position, amplitude,
     width, background and gradient, at first of a Gaussian; where noise cannot explain what that
     leaves, together with a second, smaller Gaussian beside it, or of a box with soft edges and
     bright rims, which has two parameters more. Full pixels count only as far as the fit must not
     stay below them.
+
+    One pixel alone is taken for a hot one, unless the correction has a dark pattern or an unlit
+    frame is given: then hot pixels are known, and it is an LED in sharp focus. Without, such an LED
+    is found where it leaves 3 % of its light beside the pixel. As to where in its pixel it is, sigma
+    says what is not known; nothing narrower than a pixel is told from one as wide.
 
     A position's standard deviation is what noise alone makes of it: photons, reading, and what the
     correction says of unknown response. Where a line is noisier than the correction says, its own
@@ -425,7 +430,8 @@ class SpikeFinder:
         self.limit = check.whole("limit", limit)
         self.threshold = check.positive("threshold", threshold)
         self._kind = _DETECTORS.index(detector)
-        self._settings = self.correction._settings(self.threshold, _FRACTION)
+        known = float(np.any(self.correction.pattern))
+        self._settings = self.correction._settings(self.threshold, _FRACTION, known)
 
     def __call__(
         self,
@@ -451,7 +457,8 @@ class SpikeFinder:
         -------
         list of Spike
             One for each window, `MISSING` where there is none, and the highest where there are
-            more; of the whole line, the strongest first.
+            more, wherever in the window it is: not the one nearest to its middle. Of the whole
+            line, the strongest first.
         """
         correction = self.correction
         if windows is None:

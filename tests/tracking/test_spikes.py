@@ -202,6 +202,134 @@ def test_exact_light_of_real_heads(name: str, y: float, angle: float) -> None:
     assert float(np.mean(sigmas)) / rms == pytest.approx(1, abs=0.18)
 
 
+FIELD = np.arange(0, 25.01, 0.5)
+
+
+def across(name: str, y: float, angle: Array) -> Array:
+    """Exact profiles of an LED across the field, peaks 1."""
+    light = spikes(
+        DESIGNS[name].system, SCENE, y * np.tan(np.radians(angle)), np.full(angle.size, y)
+    )
+    return np.asarray(light.electrons / light.electrons.max(axis=1, keepdims=True))
+
+
+@pytest.mark.parametrize("name", ["slit-4mm", "slit-f50-f100", "thesis"])
+@pytest.mark.parametrize("y", [1300.0, 2500.0, 4150.0])
+def test_the_whole_field_of_real_heads(name: str, y: float) -> None:
+    """Out to 25°, bright and faint: never one horn alone, and stated sigmas are true."""
+    rng = np.random.default_rng(17)
+    finder = SpikeFinder(CORRECTION, limit=1)
+    light = across(name, y, FIELD)
+    for peak in (PEAK, 0.05 * NOISE.full_well):
+        errors, sigmas = [], []
+        for charge in light:
+            exact = finder.profile(peak * charge + AMBIENT)
+            for _ in range(3):
+                (found,) = finder(read(peak * charge + AMBIENT, rng))
+                errors.append(found.position - exact.position)
+                sigmas.append(found.sigma)
+        assert np.abs(errors).max() < (0.15 if peak == PEAK else 0.6)
+        assert np.median(sigmas) > 0.8 * np.std(errors)
+        assert np.sqrt(np.mean(np.square(sigmas))) > 0.8 * np.std(errors)
+
+
+@pytest.mark.parametrize(
+    ("name", "most"), [("slit-4mm", 0.1), ("slit-f50-f100", 0.1), ("thesis", 0.3)]
+)
+@pytest.mark.parametrize("y", [1300.0, 2500.0, 4150.0])
+def test_positions_are_continuous_along_the_field(name: str, y: float, most: float) -> None:
+    """An LED that moves by 0.1° makes no jump, at any amount of light."""
+    finder = SpikeFinder(CORRECTION, limit=1)
+    angle = np.arange(17, 25.01, 0.1)
+    for peak in (PEAK, 0.05 * NOISE.full_well):
+        places = np.array(
+            [finder.profile(peak * c + AMBIENT).position for c in across(name, y, angle)]
+        )
+        tangent = np.tan(np.radians(angle))
+        smooth = np.polynomial.Legendre.fit(tangent, places, 5)(tangent)
+        assert np.abs(np.diff(places - smooth)).max() < most
+
+
+def test_horns_as_sharp_as_of_a_point() -> None:
+    """One pixel wide, unequal, with a tenth of their height between: still one spike, in a window too."""
+    rng = np.random.default_rng(18)
+    finder = SpikeFinder(CORRECTION)
+    for _ in range(60):
+        apart, peak = rng.integers(12, 44), rng.uniform(0.05, 0.7) * NOISE.full_well
+        light = np.full(PIXELS, 2.0 * NOISE.electrons_per_code)
+        light[1500 : 1500 + apart] += 0.14 * peak
+        light[1500], light[1501] = peak, 0.5 * peak
+        light[1499 + apart], light[1498 + apart] = 0.8 * peak, 0.6 * peak
+        middle = 1499.5 + apart / 2
+        frame = read(light, rng)
+        for found in (finder(frame), finder(frame, windows=[(1400, 1650)])):
+            (spike,) = found
+            assert abs(spike.position - middle) < 1
+            assert spike.flags == SpikeFlags.DOUBLE
+
+
+KNOWN = replace(CORRECTION, pattern=np.full(PIXELS, 1e-3))
+"""With a dark pattern, as of a sensor that was measured: it has no hot pixels left."""
+
+
+@pytest.mark.parametrize("detector", DETECTORS)
+@pytest.mark.parametrize("fwhm", [0.1, 0.6, 0.9, 1.2, 1.5, 2.0])
+def test_an_led_in_sharp_focus(detector: Detector, fwhm: float) -> None:
+    """Found wherever in a pixel it is, and nobody says that a place in a pixel is known."""
+    rng = np.random.default_rng(19)
+    finder = SpikeFinder(KNOWN, detector=detector)
+    errors, sigmas = [], []
+    for _ in range(150):
+        centre = rng.uniform(1000, 1100)
+        light = gaussian(fwhm, centre)
+        (found,) = finder(read(PEAK * light / light.max() + AMBIENT, rng))
+        errors.append(found.position - centre)
+        sigmas.append(found.sigma)
+        assert found.width >= 1
+        assert found.sigma < 0.6
+    assert np.abs(errors).max() < 0.6
+    # the derivative's own smoothing is no wider than a pixel
+    if detector == "likelihood" or fwhm < 1.2:
+        assert np.sqrt(np.mean(np.square(sigmas))) > 0.8 * np.std(errors)
+
+
+def test_light_on_one_pixel_alone() -> None:
+    """Where the dark pattern was measured, or an unlit frame is given, it is an LED; else a hot pixel."""
+    rng = np.random.default_rng(20)
+    light = np.full(PIXELS, AMBIENT)
+    unlit = read(light, rng)
+    light[1200] += PEAK
+    frame = read(light, rng)
+    for detector in DETECTORS:
+        assert SpikeFinder(CORRECTION, detector=detector)(frame) == []
+        for found in (
+            SpikeFinder(KNOWN, detector=detector)(frame),
+            SpikeFinder(CORRECTION, detector=detector)(frame, unlit=unlit),
+            [SpikeFinder(CORRECTION, detector=detector).profile(light)],
+        ):
+            (spike,) = found
+            assert spike.position == pytest.approx(1200, abs=0.1)
+            assert spike.sigma == pytest.approx(1 / math.sqrt(12), rel=0.05)
+            assert spike.height == pytest.approx(PEAK, rel=0.05)
+    # what electrons wander in the silicon is enough to tell an LED: 0.003 mm, a tenth beside
+    for centre in rng.uniform(1000, 1100, 30):
+        blurred = gaussian(0.003 / 0.008 / SIGMA, float(centre))
+        (spike,) = SpikeFinder(CORRECTION)(read(PEAK * blurred + AMBIENT, rng))
+        assert abs(spike.position - centre) < 0.1
+
+
+def test_measured_hot_pixels_are_no_spikes() -> None:
+    """Bright without light: gone with the dark pattern, which does not hide an LED on one pixel."""
+    rng = np.random.default_rng(21)
+    pattern = np.where(PLACE % 173 == 0, 300.0, 0.0)
+    finder = SpikeFinder(replace(CORRECTION, pattern=pattern))
+    depth = pattern + 1.3 * rng.standard_normal(PIXELS)
+    assert finder(coded(depth)) == []
+    depth[1500] += 400
+    (spike,) = finder(coded(depth))
+    assert spike.position == pytest.approx(1500, abs=0.01)
+
+
 # the other detectors ----------------------------------------------------------------------------
 
 
