@@ -8,8 +8,10 @@ come from entry points of the group ``linetrack.commands``, each naming a functi
 from __future__ import annotations
 
 import errno
+import re
 import sys
-from pathlib import Path  # noqa: TC003  (typer looks at the annotations)
+from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 try:
@@ -110,21 +112,56 @@ class _Group(TyperGroup):
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         command = super().get_command(ctx, cmd_name)
         if command is None and (point := _plugins().get(cmd_name)) is not None:
-            command = TyperCommand(cmd_name, help=f"From {point.module.partition('.')[0]}.")
+            command = TyperCommand(cmd_name, help=_about(point))
             command.rich_help_panel = "From other packages"
         return command
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        name, command, rest = super().resolve_command(ctx, args)
-        if name in _plugins() and name not in self.commands:
-            command = _loaded(_plugins()[name])
-        return name, command, rest
+        if args[0] not in self.commands and (point := _plugins().get(args[0])) is not None:
+            return args[0], _loaded(point), args[1:]
+        return super().resolve_command(ctx, args)
 
 
 def _plugins() -> dict[str, EntryPoint]:
     from importlib.metadata import entry_points
 
     return {point.name: point for point in entry_points(group=GROUP)}
+
+
+def _about(point: EntryPoint) -> str:
+    """What a command of another package says of itself, read from its source: nothing is imported.
+
+    That is the docstring of its function; of a `typer.Typer`, that of the one command it has.
+    """
+    import ast
+
+    inner = r"(?:[ \t)].*\n|\n)*"  # lines of a definition after its first
+    decorated = rf"@{point.attr}\.command\b.*\n{inner}(?:@.*\n{inner})*def "
+    with suppress(ImportError, OSError, SyntaxError, ValueError):
+        # to parse all of a file takes longer than all the rest of the help
+        found = re.findall(
+            rf"^(?:{decorated}|def {point.attr}\b).*\n{inner}", _source(point.module), re.MULTILINE
+        )
+        if len(found) == 1:
+            (function,) = ast.parse(found[0]).body
+            if isinstance(function, ast.FunctionDef) and (text := ast.get_docstring(function)):
+                return text
+    return f"From {point.module.partition('.')[0]}."
+
+
+def _source(module: str) -> str:
+    """Source of a module, found without importing the packages that it is in."""
+    from importlib.machinery import PathFinder
+
+    path, name = None, ""
+    for part in module.split("."):
+        name = f"{name}.{part}" if name else part
+        spec = PathFinder.find_spec(name, path)
+        if spec is None:
+            raise ImportError(f"no module {name}")
+        path = spec.submodule_search_locations
+    assert spec is not None  # noqa: S101  # a name has a part
+    return Path(spec.origin or "").read_text(encoding="utf-8")
 
 
 def _loaded(point: EntryPoint) -> Any:

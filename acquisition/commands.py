@@ -194,11 +194,10 @@ def capture(
     console = Console(stderr=True, quiet=quiet)
     error: BaseException | None = None
     with ExitStack() as stack:
-        device = stack.enter_context(_open(link, argument))
+        device = stack.enter_context(open_device(link, argument))
         source = Capture(device, command, firmware=published)
-        stack.callback(_close, source)
+        pressed = stack.enter_context(until_ctrl_c(source))
         tally = Tally(source)
-        pressed = stack.enter_context(_ctrl_c(source))
         metadata = {
             "link": " ".join([link, *([argument] if argument else [])]),
             "command": _as_json(command),
@@ -257,7 +256,16 @@ def _published(firmware: str, *, stream: bool) -> Firmware:
     return "original"
 
 
-def _open(link: str, argument: str | None, **options: Any) -> Link:
+def open_device(link: str, argument: str | None, **options: Any) -> Link:
+    """Open what ``--link`` names, as `open_link` does.
+
+    Raises
+    ------
+    UsageError
+        If there is no link of this name.
+    LinkUnavailable, LinkError
+        As from `open_link`.
+    """
     try:
         return open_link(link, argument, **options)
     except LinkUnavailable as error:
@@ -266,14 +274,9 @@ def _open(link: str, argument: str | None, **options: Any) -> Link:
         raise UsageError(str(error)) from error
 
 
-def _close(source: Capture) -> None:
-    with suppress(ValueError):  # its thread hangs in the link: given up with the second Ctrl-C
-        source.close()
-
-
 @contextmanager
-def _ctrl_c(source: Capture) -> Iterator[threading.Event]:
-    """Let Ctrl-C end the capture, and yield what it sets.
+def until_ctrl_c(source: Capture) -> Iterator[threading.Event]:
+    """Let Ctrl-C end a capture, and yield what it sets; the capture is closed at the end.
 
     It interrupts nothing but waiting; one that comes when that has not helped does.
     """
@@ -293,6 +296,8 @@ def _ctrl_c(source: Capture) -> Iterator[threading.Event]:
         yield pressed
     finally:
         signal.signal(signal.SIGINT, before)
+        with suppress(ValueError):  # its thread hangs in the link: given up with the second Ctrl-C
+            source.close()
 
 
 def _until(
@@ -589,7 +594,7 @@ def live(
     command = _command(sh, icg, None, None, leds, stream=stream)
     options = {"realtime": True} if link == "replay" else {}
     console, tally, view = Console(), Tally(), _View()
-    with _open(link, argument, **options) as device, _keys() as pressed:
+    with open_device(link, argument, **options) as device, _keys() as pressed:
         source = _endless(device, command, published, tally)
         screen = Live(console=console, auto_refresh=False, vertical_overflow="crop")
         with closing(source), screen if console.is_terminal else nullcontext():

@@ -34,7 +34,7 @@ import tomllib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 from raytransfer import _checks as check
 from raytransfer._data import FOLDER
@@ -102,6 +102,47 @@ class Design:
                 "numbers are those of its file in data/sensors"
             )
 
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """Read what a design file says once TOML is read, as a session's metadata keeps it.
+
+        Raises
+        ------
+        ValueError, TypeError
+            As `load_design`, without a path.
+        """
+        if data.get("format") != FORMAT:
+            raise ValueError(f"this is no design file: it does not begin with format = {FORMAT!r}")
+        version = data.get("version")
+        if version != VERSION or isinstance(version, bool):
+            raise ValueError(
+                f"version = {version!r}: this program reads version {VERSION}; "
+                "was the file written by a later one?"
+            )
+        table = Table("", dict(data))
+        table.of({"format", "version", "name", "sensor", "sensor_distance", "gaps", "element"})
+        table.and_maybe({"notes", "sensor_placement"})
+        sensor = table.known("sensor", SENSORS)
+        tables = [
+            Table(f"element {number}, ", entry)
+            for number, entry in enumerate(table.get("element", list), start=1)
+        ]
+        elements = tuple(_element(entry, sensor) for entry in tables)
+        placements = tuple(_placement(at) for entry in tables if (at := entry.inner("placement")))
+        if placements and len(placements) < len(elements):
+            raise ValueError("placement: give one for each element, or none")
+        sensor_at = table.inner("sensor_placement")
+        system = OpticalSystem(
+            table.get("name", str),
+            elements,
+            tuple(table.numbers("gaps")),
+            table.number("sensor_distance"),
+            placements,
+            NOMINAL if sensor_at is None else _placement(sensor_at),
+        )
+        notes = table.get("notes", str) if "notes" in data else ""
+        return cls(system, sensor, notes)
+
 
 def save_design(
     system: OpticalSystem,
@@ -168,7 +209,7 @@ def load_design(path: str | os.PathLike[str] | Traversable) -> Design:
     file = Path(path) if isinstance(path, str | os.PathLike) else path
     data = file.read_bytes()
     try:
-        return _design(tomllib.loads(data.decode("utf-8")))
+        return Design.from_dict(tomllib.loads(data.decode("utf-8")))
     except (ValueError, TypeError) as error:
         raise ValueError(f"{file}: {error}") from error
 
@@ -262,42 +303,21 @@ def _placement_entry(placement: Placement) -> dict[str, list[float]]:
     return {"decentre": list(placement.decentre), "tilt": list(placement.tilt)}
 
 
-def _design(data: dict[str, Any]) -> Design:
-    if data.get("format") != FORMAT:
-        raise ValueError(f"this is no design file: it does not begin with format = {FORMAT!r}")
-    version = data.get("version")
-    if version != VERSION or isinstance(version, bool):
-        raise ValueError(
-            f"version = {version!r}: this program reads version {VERSION}; "
-            "was the file written by a later one?"
-        )
-    table = _Table("", data)
-    table.of({"format", "version", "name", "sensor", "sensor_distance", "gaps", "element"})
-    table.and_maybe({"notes", "sensor_placement"})
-    sensor = table.known("sensor", SENSORS)
-    tables = [
-        _Table(f"element {number}, ", entry)
-        for number, entry in enumerate(table.get("element", list), start=1)
-    ]
-    elements = tuple(_element(entry, sensor) for entry in tables)
-    placements = tuple(_placement(at) for entry in tables if (at := entry.inner("placement")))
-    if placements and len(placements) < len(elements):
-        raise ValueError("placement: give one for each element, or none")
-    sensor_at = table.inner("sensor_placement")
-    system = OpticalSystem(
-        table.get("name", str),
-        elements,
-        tuple(table.numbers("gaps")),
-        table.number("sensor_distance"),
-        placements,
-        NOMINAL if sensor_at is None else _placement(sensor_at),
-    )
-    notes = table.get("notes", str) if "notes" in data else ""
-    return Design(system, sensor, notes)
+class Table:
+    """A table of a TOML file, read strictly; messages say which table they are about.
 
+    Parameters
+    ----------
+    where : str
+        Its name, as messages begin: ``"element 2, "``; empty for the file itself.
+    data : dict
+        What it holds.
 
-class _Table:
-    """A table of the file, with its name for messages."""
+    Raises
+    ------
+    TypeError
+        If it is no table.
+    """
 
     def __init__(self, where: str, data: Any) -> None:
         if not isinstance(data, dict):
@@ -348,12 +368,12 @@ class _Table:
             raise ValueError(f"{self.where}{key} = {values}: {length} numbers are needed")
         return [check.number(f"{self.where}{key}[{i}]", value) for i, value in enumerate(values)]
 
-    def inner(self, key: str) -> _Table | None:
+    def inner(self, key: str) -> Table | None:
         """Return a table within this one, if it is there."""
-        return _Table(f"{self.where}{key}, ", self.data[key]) if key in self.data else None
+        return Table(f"{self.where}{key}, ", self.data[key]) if key in self.data else None
 
 
-def _placement(table: _Table) -> Placement:
+def _placement(table: Table) -> Placement:
     table.of({"decentre", "tilt"})
     table.and_maybe(set())
     across, up = table.numbers("decentre", 2)
@@ -361,11 +381,11 @@ def _placement(table: _Table) -> Placement:
     return Placement((across, up), (about_x, about_y, about_z))
 
 
-def _material(table: _Table) -> Material:
+def _material(table: Table) -> Material:
     if isinstance(table.data["material"], str):
         material: Material = table.known("material", MATERIALS)
         return material
-    glass = _Table(f"{table.where}material, ", table.data["material"])
+    glass = Table(f"{table.where}material, ", table.data["material"])
     if "n" in glass.data:
         glass.of({"name", "n"})
         glass.and_maybe(set())
@@ -382,7 +402,7 @@ def _material(table: _Table) -> Material:
     return Sellmeier(glass.get("name", str), tuple(strengths), tuple(resonances), (low, high))
 
 
-def _element(table: _Table, sensor: LineSensor) -> Element:
+def _element(table: Table, sensor: LineSensor) -> Element:
     kinds = ("lens", "spherical lens", "plate", "window", "screen")
     kind = table.data.get("kind")
     if kind not in kinds:
@@ -408,7 +428,7 @@ def _element(table: _Table, sensor: LineSensor) -> Element:
     return make(table.get("part", str), material=_material(table), **_sizes(table, kind))
 
 
-def _lens(table: _Table, described: set[str]) -> Lens:
+def _lens(table: Table, described: set[str]) -> Lens:
     full = bool(described & set(table.data))
     table.of({"kind", "part", *(described if full else ())})
     table.and_maybe({"bends", "reversed", "clear", "placement"})
@@ -428,7 +448,7 @@ def _lens(table: _Table, described: set[str]) -> Lens:
     return lens
 
 
-def _sizes(table: _Table, kind: str) -> dict[str, float]:
+def _sizes(table: Table, kind: str) -> dict[str, float]:
     return {
         size: table.number(size, endless=size in ("front_radius", "back_radius"))
         for size in _SIZES[kind]

@@ -246,7 +246,7 @@ def _follow(
     from rich.console import Console
 
     from acquisition.capture import Capture
-    from acquisition.commands import Tally, _close, _ctrl_c, _open
+    from acquisition.commands import Tally, open_device, until_ctrl_c
     from acquisition.links import LinkError
     from tracking.poses import Prior
     from tracking.tracker import Tracker, default_schedule, first_command, follow
@@ -257,7 +257,7 @@ def _follow(
         icg = -(-STREAM_ICG // sh) * sh
     with ExitStack() as stack:
         stack.callback(writer.close)
-        device = stack.enter_context(_open(link, argument))
+        device = stack.enter_context(open_device(link, argument))
         known = _calibration(device, calibration, led_map, head)
         try:
             tracker = Tracker(
@@ -270,8 +270,7 @@ def _follow(
         except ValueError as error:
             raise UsageError(str(error)) from error
         source = Capture(device, command)
-        stack.callback(_close, source)
-        pressed = stack.enter_context(_ctrl_c(source))
+        pressed = stack.enter_context(until_ctrl_c(source))
         tally = Tally(source)
         watch = _Watch(console, known.leds)
         poses = 0
@@ -311,7 +310,7 @@ def _thesis(
 ) -> int:
     from contextlib import suppress
 
-    from acquisition.commands import ORIGINAL_ICG, _open
+    from acquisition.commands import ORIGINAL_ICG, open_device
     from acquisition.links import LinkError
     from acquisition.protocol import Command, CommandError
     from tracking.baseline import positions
@@ -325,7 +324,7 @@ def _thesis(
         raise UsageError(str(error)) from error
     mapping = _four_corners(corners, area)
     number = invalid = 0
-    with _open(link, argument) as device, suppress(KeyboardInterrupt):
+    with open_device(link, argument) as device, suppress(KeyboardInterrupt):
         for reading in positions(device, mapping, count=count or None, command=command):
             sys.stdout.write(f"{reading}\n")
             sys.stdout.flush()
@@ -444,18 +443,20 @@ def _calibration(
     from dataclasses import replace
 
     from tracking.calibration import Calibration, load_calibration
+    from tracking.nominal import nominal_camera
 
     if path is not None:
         if head is not None:
             raise UsageError(f"--head {head}: the calibration has a camera already; one of the two")
         measured = load_calibration(path)
         return measured if leds is None else replace(measured, leds=leds)
-    return Calibration.nominal(_design(device, head), _leds(device) if leds is None else leds)
+    camera = nominal_camera(_design(device, head))
+    return Calibration(camera, _leds(device) if leds is None else leds)
 
 
 def _design(device: Link, head: str | None) -> Design:
     """The lens head: the one named, or what the link knows, or the thesis's."""
-    from raytransfer.designs import DESIGNS, _design, load_design
+    from raytransfer.designs import DESIGNS, Design, load_design
 
     if head is not None:
         if head in DESIGNS:
@@ -469,7 +470,7 @@ def _design(device: Link, head: str | None) -> Design:
     if not about:
         return DESIGNS["thesis"]
     try:
-        return _design(dict(about["description"]))
+        return Design.from_dict(about["description"])
     except (ValueError, TypeError, KeyError) as error:
         raise UsageError(
             f"the head described in the recording, {about.get('name', '')!r}, is no design "

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from raytransfer import plots
-from raytransfer.explorer import _png
+from raytransfer.explorer import encode_png
 from tracking.motion import Outcome
 from tracking.output import as_text
 from tracking.poses import PoseFlags
@@ -243,7 +243,7 @@ class Map:
         for axes, artists in self.moving.items():
             for artist in artists:
                 axes.draw_artist(artist)
-        return _png(np.asarray(self._canvas.buffer_rgba())[..., :3])
+        return encode_png(np.asarray(self._canvas.buffer_rgba())[..., :3])
 
     def _place(self) -> None:
         positions = self._leds.positions[:, :2] / 1000

@@ -57,6 +57,12 @@ PLACED: Final = 0.5
 PEAK: Final = 30_000.0
 """Height of a spike that exposures aim for, electrons: a third of what fills a pixel."""
 
+UNLIT_EVERY: Final = 20
+"""Frames from one without light to the next, if nothing else is said: 5 % of them."""
+
+END: Final = 60.0
+"""Pixels at the ends of the line where part of a spike's light may be beyond it."""
+
 _ENTRIES = 14  # of the table that a running capture in spikes mode can change
 _SPEED = 1000.0  # mm/s; what is not known better
 _TURNING = 1.5  # rad/s
@@ -65,7 +71,9 @@ _WIDTH = 40.0  # px of a spike that was not seen yet
 _REACH = 1.5  # widths that a spike's light reaches to either side
 _MARGIN = 8.0  # px of background beyond it
 _ODD = SpikeFlags.MISSING | SpikeFlags.CLIPPED | SpikeFlags.DOUBLE
+_UNCERTAIN = SpikeFlags.CLIPPED | SpikeFlags.DOUBLE
 _USUAL = 1.6  # times the mean width: wider is unusual
+_LEAST = 0.15  # of a lamp's height by which its light may have changed
 _APART = 1.0  # widths: spikes of one frame that are nearer cannot be told apart
 
 
@@ -114,6 +122,10 @@ class Tracker:
     schedule : Schedule, optional
         What to light. Left out, a `PredictedVisible` of up to three LEDs a frame, with an SH period
         of 100 clocks and the shortest ICG period.
+    unlit_every : int
+        Frames from one in which no LED is lit to the next; 0 is never. What shines in it, a lamp, a
+        window, is subtracted where an LED is sought, as long as it stays in its place on the line.
+        Not in spikes mode, in which nothing can be subtracted.
     **motion
         Further options of `MotionFilter`.
 
@@ -125,7 +137,8 @@ class Tracker:
     Raises
     ------
     ValueError
-        There are too few LEDs, or a heading that is neither known nor open.
+        There are too few LEDs, or a heading that is neither known nor open; unlit_every is below 0
+        or 1.
     """
 
     def __init__(
@@ -136,6 +149,7 @@ class Tracker:
         height: Prior = Prior(0.0, 0.0),  # noqa: B008  # immutable
         detector: Detector = "likelihood",
         schedule: Schedule | None = None,
+        unlit_every: int = UNLIT_EVERY,
         **motion: Any,
     ) -> None:
         leds = calibration.leds
@@ -150,6 +164,14 @@ class Tracker:
             )
         if heading.sigma and len(leds) == 2:
             raise ValueError("two LEDs do not tell the heading: give one, or a map of three")
+        if unlit_every < 0 or unlit_every == 1:
+            raise ValueError(
+                f"unlit_every = {unlit_every}: allowed are 2 and more frames, or 0 for never"
+            )
+        self._unlit_every = unlit_every
+        self._since_unlit = unlit_every  # frames
+        self._unlit: Frame | None = None  # the newest
+        self._lamps: list[Spike] = []  # that shine in it
         self._heading = heading if heading.sigma == 0 else None
         self.calibration = calibration
         self.leds = leds
@@ -204,7 +226,10 @@ class Tracker:
         t_ns = self._time(frame)
         lost = self._filter.lost
         spikes: dict[int, Spike] = {}
+        self._since_unlit += 1
         if not frame.flags & FrameFlags.INVALID:
+            if isinstance(frame, Frame) and not frame.channels:
+                self._unlit, self._lamps = frame, self._finder(frame)
             spikes = self._sought(frame) if lost else self._expected(frame, t_ns)
         # LEDs go out together: the longest exposure has the earliest middle
         lit = {n: frame.exposures.get(n, frame.sh_period) for n in spikes}
@@ -216,7 +241,7 @@ class Tracker:
         found = []
         for channel, clocks in sorted(lit.items(), key=lambda item: -item[1]):
             middle = t_ns - round(clocks / frame.master_clock * 0.5e9)
-            spike = self._accustomed(channel, spikes[channel])
+            spike = self._judged(channel, spikes[channel])
             if self._filter.lost and self._heading is not None:
                 found.append(self._keep(middle, channel, spike))
             else:
@@ -240,8 +265,13 @@ class Tracker:
         assert self._t_ns is not None  # noqa: S101  # set by update
         return Step(frame, self._t_ns, estimate, self.innovations)
 
-    def sequence(self) -> list[dict[int, int]] | None:
+    def sequence(self, *, spikes: bool = False) -> list[dict[int, int]] | None:
         """What to light in the next frames: exposure in master clocks by channel, frame by frame.
+
+        Parameters
+        ----------
+        spikes : bool
+            Whether the microcontroller finds the spikes: then no frame is left unlit.
 
         Returns
         -------
@@ -252,7 +282,11 @@ class Tracker:
             return None
         self._told.clear()
         frames = self._left = min(AHEAD, max(1, _ENTRIES // self.schedule.per_frame))
-        return self.schedule.sequence(self._filter, self._t_ns or 0, frames)
+        unlit: list[dict[int, int]] = []
+        if self._unlit_every and not spikes and self._since_unlit >= self._unlit_every:
+            unlit, frames = [{}], max(frames - 1, 1)
+            self._since_unlit = 0
+        return unlit + self.schedule.sequence(self._filter, self._t_ns or 0, frames)
 
     def windows(self, sequence: Sequence[Mapping[int, int]]) -> list[list[tuple[int, int]]]:
         """Where the microcontroller shall look for the spikes of a `sequence` just planned.
@@ -282,7 +316,7 @@ class Tracker:
         codes = np.full(ELEMENTS, 3900, np.uint16)
         codes[2000:2010] = 3000
         self._finder(Frame(codes))
-        self._finder(Frame(codes), windows=[(1900, 2000)])
+        self._finder(Frame(codes), windows=[(1900, 2000)], unlit=Frame(codes))
         camera, leds = self.calibration.camera, self.leds
         x, y = leds.positions[:, 0].mean(), leds.positions[:, 1].max() + 3000.0
         pixels = camera.project(optical(leds.positions, x, y, 0.0, self._motion["height"].value))
@@ -315,6 +349,7 @@ class Tracker:
         self._seen: dict[int, tuple[int, Spike]] = {}  # latest, while lock is lost
         self._last: Estimate | None = None  # that was known
         self._fresh = PoseFlags.NONE  # of a pose just found
+        self._unlit, self._lamps = None, []
 
     def _time(self, frame: Frame | SpikeFrame) -> int:
         """End of the exposure, ns; of frames without a time, one read-out after the other."""
@@ -352,7 +387,8 @@ class Tracker:
         expected = self._filter.expected(max(t_ns, self._filter.t_ns))
         windows = self._lit_windows(frame.channels, expected)
         if isinstance(frame, Frame):
-            spikes = self._finder(frame, windows=list(windows.values()))
+            places = list(windows.values())
+            spikes = self._finder(frame, windows=places, unlit=self._background(frame, places))
             return dict(zip(windows, spikes, strict=True))
         found = self._whole_line(frame)
         return {
@@ -360,19 +396,56 @@ class Tracker:
             for channel, (first, last) in windows.items()
         }
 
-    def _accustomed(self, channel: int, spike: Spike) -> Spike:
-        """Forgive a double peak to a spike no wider than this LED's are: it is the head's caustic.
+    def _judged(self, channel: int, spike: Spike) -> Spike:
+        """How far a spike is believed: DOUBLE and CLIPPED ones the filter takes for less sure.
 
-        LEDs that would meet are not looked for at once, so that a second one does not hide here.
+        A double peak no wider than this LED's spikes are is the head's caustic: LEDs that would meet
+        are not looked for at once, so that a second one does not hide here. At the end of the line
+        some light may be lacking. A reflection pulls a spike as a second LED would; once a pose is
+        known that is left to the filter's gate, which with less sure spikes would be wider.
         """
-        if spike.flags & SpikeFlags.DOUBLE and spike.width < _USUAL * self._widths[channel]:
-            return replace(spike, flags=spike.flags & ~SpikeFlags.DOUBLE)
-        return spike
+        if not spike.found:
+            return spike
+        flags = spike.flags
+        if flags & SpikeFlags.DOUBLE and spike.width < _USUAL * self._widths[channel]:
+            flags &= ~SpikeFlags.DOUBLE
+        if flags & SpikeFlags.REFLECTION and self._filter.lost:
+            flags |= SpikeFlags.DOUBLE
+        if not END <= spike.position <= TCD1304.pixels - 1 - END:
+            flags |= SpikeFlags.CLIPPED
+        return replace(spike, flags=flags) if flags != spike.flags else spike
+
+    def _background(
+        self, frame: Frame, windows: Collection[tuple[int, int]] | None = None
+    ) -> Frame | None:
+        """The unlit frame, if lamps that it shows in the windows are still where they were.
+
+        An LED only adds light: where there is less than in the unlit frame, a lamp has moved.
+        """
+        unlit = self._unlit
+        if unlit is None or not self._lamps or unlit.sh_period != frame.sh_period:
+            return None
+        gain, noise = self._finder.correction.electrons_per_code, self._finder.correction.read_noise
+        levels = frame.dark_level, unlit.dark_level
+        met = False
+        for lamp in self._lamps:
+            first, last = max(int(lamp.position - lamp.width), 0), int(lamp.position + lamp.width)
+            if windows is not None and not any(a <= last and first <= b for a, b in windows):
+                continue
+            met = True
+            core = slice(first, last + 1)
+            more = (levels[0] - frame.pixels[core].astype(float)) - (
+                levels[1] - unlit.pixels[core].astype(float)
+            )
+            doubt = 4 * math.sqrt(2 * (lamp.height + noise**2))
+            if more.min() * gain < -_LEAST * lamp.height - doubt:
+                return None
+        return unlit if met else None
 
     def _whole_line(self, frame: Frame | SpikeFrame) -> list[Spike]:
         """All spikes, the strongest first."""
         if isinstance(frame, Frame):
-            return self._finder(frame)
+            return self._finder(frame, unlit=self._background(frame) if frame.channels else None)
         gain, noise = self._finder.correction.electrons_per_code, self._finder.correction.read_noise
         found = [_from_device(s, gain, noise, self._unevenness) for s in frame.spikes]
         return sorted(found, key=lambda spike: -spike.height)
@@ -423,7 +496,12 @@ class Tracker:
         camera = self.calibration.camera
         smear = abs(camera.scale) * _STROLL / 1000  # px/s, seen from a metre
         ages = np.array([t_ns - at for at, _ in recent.values()]) * 1e-9
-        sigmas = np.array([spike.sigma for _, spike in recent.values()])
+        sigmas = np.array(
+            [
+                math.hypot(s.sigma, s.width / 4 if s.flags & _UNCERTAIN else 0.0)
+                for _, s in recent.values()
+            ]
+        )
         fix = locate(
             camera,
             self.leds.positions[[self.leds.index(n) for n in recent]],
@@ -526,7 +604,8 @@ def first_command(tracker: Tracker, *, count: int = 0, spikes: bool = False) -> 
     """
     schedule = tracker.schedule
     mode = Mode.SPIKES if spikes else Mode.STREAM
-    sequence = tracker.sequence() or ()  # while lock is lost, spikes are sought on the whole line
+    # without windows: while lock is lost, spikes are sought on the whole line
+    sequence = tracker.sequence(spikes=spikes) or ()
     icg_period = round(schedule.period_ns * MASTER_CLOCK * 1e-9)
     return Command(schedule.sh_period, icg_period, count, mode, sequence)
 
@@ -547,10 +626,11 @@ def follow(capture: Capture, tracker: Tracker, *, steer: bool = True) -> Generat
     Step
         One for each frame; the first ones without a pose.
     """
+    spikes = capture.command.mode is Mode.SPIKES
     for frame in capture:
         step = tracker.step(frame)
-        if steer and (wanted := tracker.sequence()) is not None:
-            if capture.command.mode is Mode.SPIKES:
+        if steer and (wanted := tracker.sequence(spikes=spikes)) is not None:
+            if spikes:
                 windows = tracker.windows(wanted)
                 capture.send(replace(capture.command, sequence=wanted, windows=windows))
             else:

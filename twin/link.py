@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from acquisition.frames import CHANNELS
+from acquisition.frames import CHANNELS, MASTER_CLOCK
 from acquisition.links import LinkError, LinkUnavailable
+from acquisition.protocol import ICG_MIN
+from acquisition.wiring import PROTOCOL, sh_edge
 from raytransfer.designs import DESIGNS, Design, design_text, load_design
 from twin.machine import CLOCK, Machine
 from twin.rooms import FORMAT as ROOM
-from twin.rooms import ROOMS, load_room
+from twin.rooms import ROOMS, KnownLeds, load_room
 from twin.sensor import Electronics, SensorModel
 from twin.world import World
 
@@ -33,6 +35,9 @@ LIGHT_STEP = 50e-6
 """Virtual seconds for which light counts as constant: 50 nm of way at 1 m/s."""
 
 IMAGE = "F401_FW_TCD1304.elf"
+
+_CYCLES = CLOCK // MASTER_CLOCK
+_SETTLED = 50 * CLOCK // 1_000_000  # cycles until the interrupt of an exposure's end is over
 
 
 def firmware_image() -> Path:
@@ -69,6 +74,15 @@ class TwinLink:
         Of the sensor and the ADC.
     record : bool
         Keep the edges of all pins, see `Machine`.
+    known_leds : KnownLeds, optional
+        What a tracker is told of the LEDs: where the plan has them. Where the world has them when
+        left out.
+
+    Attributes
+    ----------
+    world, sensor, machine
+        The room, the specimen of the sensor, the microcontroller.
+    known_leds : KnownLeds
     """
 
     def __init__(
@@ -81,6 +95,7 @@ class TwinLink:
         image: Path | None = None,
         electronics: Electronics | None = None,
         record: bool = False,
+        known_leds: KnownLeds | None = None,
     ) -> None:
         if not 0 < spi_clock <= 42e6:
             raise ValueError(f"spi_clock = {spi_clock:g} Hz: allowed is > 0 to 42e6; in MHz?")
@@ -88,6 +103,7 @@ class TwinLink:
             raise ValueError(f"host_latency = {host_latency:g} s: allowed is 0 to 10; in ms?")
         self.world = World() if world is None else world
         self.sensor = SensorModel(seed, electronics, self.world.sensor)
+        self.known_leds = KnownLeds.of(self.world.leds) if known_leds is None else known_leds
         self.spi_clock = spi_clock
         self.host_latency = host_latency
         self._rates = np.zeros((1 + CHANNELS, self.world.sensor.pixels))
@@ -134,6 +150,38 @@ class TwinLink:
         """The head in front of the sensor as its design file has it, for a session's metadata."""
         text = design_text(Design(self.world.head, self.world.sensor))
         return {"name": self.world.head.name, "description": tomllib.loads(text)}
+
+    @property
+    def clock_offset(self) -> float:
+        """World time of the device's time 0, s: a frame's ``timestamp`` (ns) is that much later.
+
+        The device counts master clocks from when it has booted. As of the newest read-out, exact to
+        the cycle: each time that a command sets other periods, its clock stands still for less than
+        a master clock.
+
+        Raises
+        ------
+        LinkError
+            If there was no read-out for longer than an ICG period, since the device waits for the
+            sync line, or it runs another firmware.
+        """
+        self._check_open()
+        try:
+            edge, period = (
+                int.from_bytes(self.machine.read(self.machine.symbol(name), size), "little")
+                for name, size in (("edge_time", 8), ("icg_period", 4))
+            )
+        except KeyError as error:
+            raise LinkError(f"this firmware does not tell its time: no {error}") from error
+        ends = self.machine.readouts["transfer"].astype(np.int64)
+        offsets = ends - (edge + sh_edge(PROTOCOL)) * _CYCLES
+        since = self.machine.time - ends
+        if not ends.size or since[-1] > period * _CYCLES + _SETTLED:
+            raise LinkError("no read-out tells the device's time: does it wait for the sync line?")
+        if since[-1] < _SETTLED:  # the interrupt may not have counted the newest one yet
+            early = offsets[(offsets > 0) & (offsets < ICG_MIN * _CYCLES)]
+            offsets = early if early.size else offsets
+        return float(offsets[-1] / CLOCK)
 
     def wait_ready(self, timeout: float) -> bool:
         """Whether the handshake line is high now or within `timeout` virtual seconds."""
@@ -183,8 +231,8 @@ def open_twin(argument: str | None = None, **options: Any) -> TwinLink:
         A room or a lens head: a room file or the name of one of `ROOMS`; a design file or the name
         of one of `DESIGNS`. The thesis's head and room when left out.
     **options
-        For `TwinLink`, without a world if there is an argument. A room's seed holds if none is
-        given.
+        For `TwinLink`, without a world if there is an argument. A room's seed and plan of the LEDs
+        hold if none is given.
 
     Raises
     ------
@@ -210,7 +258,7 @@ def _described(argument: str) -> dict[str, Any]:
         )
     if argument in ROOMS or (argument not in DESIGNS and _says(Path(argument), ROOM)):
         room = load_room(argument)
-        return {"world": room.world, "seed": room.seed}
+        return {"world": room.world, "seed": room.seed, "known_leds": room.known_leds()}
     design = DESIGNS[argument] if argument in DESIGNS else load_design(argument)
     return {"world": World(head=design.system, sensor=design.sensor)}
 

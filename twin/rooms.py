@@ -51,12 +51,12 @@ import tomllib
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
 from raytransfer import _checks as check
-from raytransfer.designs import DESIGNS, _Table, load_design
+from raytransfer.designs import DESIGNS, Table, load_design
 from twin.world import STRAIGHT, Led, Mount, Occlusion, Pose, RandomOcclusions, Wall, World
 
 if TYPE_CHECKING:
@@ -98,6 +98,15 @@ class KnownLeds(NamedTuple):
     positions: NDArray[np.float64]
     facings: NDArray[np.float64]
 
+    @classmethod
+    def of(cls, leds: Sequence[Led]) -> Self:
+        """Of these LEDs, as ``LedMap(*…)`` takes it."""
+        return cls(
+            tuple(led.channel for led in leds),
+            np.array([led.position for led in leds], dtype=float).reshape(-1, 3),
+            np.array([led.facing for led in leds], dtype=float),
+        )
+
 
 @dataclass(frozen=True)
 class Room:
@@ -122,12 +131,8 @@ class Room:
     notes: str = ""
 
     def known_leds(self) -> KnownLeds:
-        """Where a tracker is told that the LEDs are: what ``LedMap(*…)`` takes."""
-        return KnownLeds(
-            tuple(led.channel for led in self.nominal),
-            np.array([led.position for led in self.nominal], dtype=float).reshape(-1, 3),
-            np.array([led.facing for led in self.nominal], dtype=float),
-        )
+        """Where a tracker is told that the LEDs are."""
+        return KnownLeds.of(self.nominal)
 
 
 def load_room(room: str | os.PathLike[str]) -> Room:
@@ -297,7 +302,7 @@ def _room(data: dict[str, Any], folder: Path) -> Room:
             f"version = {version!r}: this program reads version {VERSION}; "
             "was the file written by a later one?"
         )
-    table = _Table("", data)
+    table = Table("", data)
     table.of({"format", "version", "name", "head", "tracker", "led"})
     table.and_maybe(
         {"notes", "seed", "ambient", "placement_error", "every_led", "mount", "wall"}
@@ -311,7 +316,7 @@ def _room(data: dict[str, Any], folder: Path) -> Room:
     error = table.number("placement_error") if "placement_error" in data else 0.0
     world = World(
         leds=_placed(nominal, check.not_negative("placement_error", error, "mm"), seed),
-        tracker=_tracker(_Table("tracker, ", data["tracker"])),
+        tracker=_tracker(Table("tracker, ", data["tracker"])),
         ambient=table.number("ambient") if "ambient" in data else 0.0,
         head=design.system,
         sensor=design.sensor,
@@ -336,14 +341,14 @@ def _head(name: str, folder: Path) -> Any:
     return load_design(folder / name)
 
 
-def _all(table: _Table, key: str) -> list[_Table]:
+def _all(table: Table, key: str) -> list[Table]:
     entries = table.get(key, list) if key in table.data else []
-    return [_Table(f"{key} {number}, ", entry) for number, entry in enumerate(entries, start=1)]
+    return [Table(f"{key} {number}, ", entry) for number, entry in enumerate(entries, start=1)]
 
 
 def _made(
     make: Callable[..., Any],
-    table: _Table,
+    table: Table,
     needed: set[str],
     more: AbstractSet[str] = frozenset(),
 ) -> Any:
@@ -357,7 +362,7 @@ def _made(
         raise ValueError(f"{table.where}{error}") from error
 
 
-def _leds(table: _Table) -> list[Led]:
+def _leds(table: Table) -> list[Led]:
     common = {"power", "wavelength", "facing", "extent"}
     every = table.inner("every_led")
     if every is not None:
@@ -379,7 +384,7 @@ def _placed(leds: Sequence[Led], error: float, seed: int) -> list[Led]:
     ]
 
 
-def _tracker(table: _Table) -> Pose | Trajectory:
+def _tracker(table: Table) -> Pose | Trajectory:
     known = ("fixed", *PATHS)
     kind = table.data.get("path")
     if kind not in known:
@@ -392,27 +397,27 @@ def _tracker(table: _Table) -> Pose | Trajectory:
         still = Tour(lambda _: (position[0], position[1], position[2]), **turns)
         return still if any(turn.amplitude for turn in turns.values()) else still(0.0)
     make, needed, more = PATHS[kind]
-    way = _Table(table.where, {k: v for k, v in table.data.items() if k not in ("path", *_TURNS)})
+    way = Table(table.where, {k: v for k, v in table.data.items() if k not in ("path", *_TURNS)})
     return Tour(_made(make, way, needed, more), **turns)
 
 
-def _swing(table: _Table, name: str) -> Swing:
+def _swing(table: Table, name: str) -> Swing:
     value = table.data.get(name, 0.0)
     if not isinstance(value, dict):
         return Swing(check.number(f"{table.where}{name}", value, "rad"))
-    entry = _Table(f"{table.where}{name}, ", value)
+    entry = Table(f"{table.where}{name}, ", value)
     entry.of({"amplitude", "frequency"})
     entry.and_maybe({"mean", "phase"})
     return Swing(**{key: entry.number(key) for key in value})
 
 
-def _mount(table: _Table) -> Mount:
+def _mount(table: Table) -> Mount:
     mount = table.inner("mount")
     made: Mount = STRAIGHT if mount is None else _made(Mount, mount, set(), {"roll", "offset"})
     return made
 
 
-def _occlusions(table: _Table, seed: int) -> list[Occlusion] | RandomOcclusions:
+def _occlusions(table: Table, seed: int) -> list[Occlusion] | RandomOcclusions:
     chance = table.inner("random_occlusions")
     if chance is None:
         entries = _all(table, "occlusion")

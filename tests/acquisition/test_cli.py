@@ -86,7 +86,35 @@ stuck = linetrack_plugin:stuck
 greet = linetrack_plugin:greet
 fail = linetrack_plugin:fail
 broken = linetrack_nowhere:command
+several = linetrack_plugin:several
+deep = linetrack_package.inner:app
 """
+PACKAGE = {
+    "__init__.py": "raise RuntimeError('imported')\n",
+    "inner.py": '''
+import typer
+
+app = typer.Typer(
+    add_completion=False,
+)
+
+
+@app.command(
+    epilog="none",
+)
+@decorated
+def main(
+    name: str = "",
+
+    more: str = "",
+) -> None:
+    """Deep down: in a package whose __init__ would fail."""
+
+
+def other():
+    """Not this."""
+''',
+}
 
 
 def frame(number: int, *, light: float = 1800.0) -> Frame:
@@ -126,6 +154,9 @@ def plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     about = folder / "linetrack_plugin-1.dist-info"
     about.mkdir(parents=True)
     (folder / "linetrack_plugin.py").write_text(PLUGIN)
+    (folder / "linetrack_package").mkdir()
+    for name, text in PACKAGE.items():
+        (folder / "linetrack_package" / name).write_text(text)
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: linetrack-plugin\nVersion: 1\n")
     (about / "entry_points.txt").write_text(ENTRY_POINTS)
     monkeypatch.syspath_prepend(str(folder))
@@ -673,8 +704,12 @@ def test_help_loads_nothing_slow() -> None:
     loaded = set(json.loads(run.stderr))
     slow = {"numpy", "h5py", "matplotlib", "scipy", "linetrack_plugin", "acquisition.commands"}
     assert not loaded & slow
-    for text in ("capture", "plot", "live", "info", "convert", "greet", "From linetrack_plugin"):
+    for text in ("capture", "plot", "live", "info", "convert", "track"):
         assert text in run.stdout
+    # of other packages what their source says, if it can be read
+    for line in ("greet +Greet someone.", "several +From linetrack_plugin.", "broken +From line"):
+        assert re.search(line, run.stdout), run.stdout
+    assert re.search(r"deep +Deep down: in a package whose __init__ would fail\.", run.stdout)
     assert "linetrack capture -i 30000 -s 100 -n 2 -o output" in run.stdout
     assert "Exit codes" in run.stdout
 

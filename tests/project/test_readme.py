@@ -52,12 +52,15 @@ def test_linetrack_commands_run(tmp_path: Path) -> None:
         "info",
         "live",
         "convert",
+        "track",
     }
     for line in lines:
         words = shlex.split(line)
         words[0] = str(Path(sys.executable).with_name("linetrack"))
         if words[1] == "live":
             words += ["--frames", "4"]  # or it waits for a key
+        elif words[1] == "track" and not {"-n", "--count"} & set(words):
+            words += ["--count", "4"]  # or it follows for ever
         subprocess.run(words, cwd=tmp_path, check=True, capture_output=True, timeout=120)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
@@ -20,10 +20,11 @@ from tracking.calibration import Calibration
 from tracking.camera import Camera
 from tracking.leds import LedMap
 from tracking.motion import Outcome
+from tracking.nominal import nominal_camera
 from tracking.poses import Estimate, PoseFlags, Prior, optical
+from tracking.spikes import Spike, SpikeFlags
 from tracking.tracker import Step, Tracker, default_schedule, first_command, follow, track
 from twin.link import TwinLink
-from twin.machine import CLOCK
 from twin.rooms import load_room
 
 if TYPE_CHECKING:
@@ -136,8 +137,9 @@ def tracker(leds: LedMap, **options: Any) -> Tracker:
 def test_two_leds_with_known_heading() -> None:
     room = Room(TWO, rest(120.0, 1700.0))
     steps = room.run(tracker(TWO), 60)
-    assert [s.estimate is None for s in steps[:2]] == [True, False]  # each LED once
-    assert all(s.estimate for s in steps[1:])
+    assert [s.lit for s in steps[:3]] == [(), (0,), (1,)]  # first the background, then each LED
+    assert [s.estimate is None for s in steps[:3]] == [True, True, False]
+    assert all(s.estimate for s in steps[2:])
     last = steps[-1].estimate
     assert last is not None
     assert last.flags == PoseFlags.HEADING_ASSUMED
@@ -220,20 +222,84 @@ def test_a_reflection_outside_the_window_is_not_looked_at() -> None:
     steps = [s for s in room.run(tracker(NINE), 170) if s.t_ns > 0.3e9]
     assert len(steps) > 75
     assert np.abs(room.errors(steps)).max(axis=0)[0] < 1
-    assert all(s.estimate and s.estimate.flags == PoseFlags.NONE for s in steps)
+    assert all(s.estimate and s.estimate.flags == PoseFlags.NONE for s in steps if s.lit)
+
+
+BAD = PoseFlags.LOST | PoseFlags.REJECTED | PoseFlags.PREDICTED | PoseFlags.INCONSISTENT
 
 
 def test_a_lamp_that_a_spike_meets_is_told() -> None:
     """Brighter than the LED, and always on: what it pulls away is flagged, and comes back."""
     room = Room(NINE, circle, ghosts=lambda s: [(500.0, 50_000.0)] if 0.3 < s < 0.9 else [])
-    steps = room.run(tracker(NINE), 400)
-    bad = PoseFlags.LOST | PoseFlags.REJECTED | PoseFlags.PREDICTED | PoseFlags.INCONSISTENT
-    met = [s.estimate.flags & bad for s in steps if s.estimate and 0.6 < s.t_ns * 1e-9 < 0.8]
+    steps = room.run(tracker(NINE, unlit_every=0), 400)
+    assert all(s.lit for s in steps)
+    met = [s.estimate.flags & BAD for s in steps if s.estimate and 0.6 < s.t_ns * 1e-9 < 0.8]
     assert sum(map(bool, met)) > 5
-    plain = [s for s in steps[60:] if s.estimate and not s.estimate.flags & bad]
+    plain = [s for s in steps[60:] if s.estimate and not s.estimate.flags & BAD]
     assert np.abs(room.errors(plain)).max(axis=0)[0] < 6
     after = [s for s in steps if s.t_ns * 1e-9 > 1.3]
     assert np.abs(room.errors(after)).max(axis=0)[0] < 1
+
+
+def test_a_steady_lamp_is_subtracted() -> None:
+    """The same lamp with frames between in which no LED is lit."""
+    room = Room(NINE, circle, ghosts=lambda s: [(500.0, 50_000.0)] if 0.3 < s < 0.9 else [])
+    steps = room.run(tracker(NINE), 400)
+    unlit = [not s.lit for s in steps]
+    assert 0.04 < np.mean(unlit) < 0.1
+    met = [s for s in steps if s.estimate and s.t_ns * 1e-9 > 0.3]
+    assert np.abs(room.errors(met)).max(axis=0)[0] < 1
+    assert not any(s.estimate.flags & BAD for s in met if s.estimate and s.lit)
+
+
+def test_two_leds_are_found_beside_a_brighter_lamp() -> None:
+    """Without the unlit frame, the strongest spike of the line would be taken for either LED."""
+    room = Room(TWO, rest(120.0, 1700.0), ghosts=lambda _: [(2500.0, 70_000.0)])
+    steps = room.run(tracker(TWO), 60)
+    assert steps[2].estimate is not None
+    assert np.abs(room.errors(steps[20:])).max(axis=0)[:2].max() < 1
+    blind = room.run(tracker(TWO, unlit_every=0), 60)
+    assert np.abs(room.errors([s for s in blind if s.estimate])).max(initial=1e3) > 100
+
+
+def test_a_lamp_that_has_moved_is_not_subtracted() -> None:
+    """It would leave a hole where it was, and itself where it is; an LED over it only adds light."""
+    lamps = [(1000.0, 30_000.0)]
+    room = Room(TWO, rest(0.0, 2000.0), ghosts=lambda _: lamps)
+    follower = tracker(TWO)
+    dark = room.frame({})
+    follower.update(dark)
+    window = [(900, 1100)]
+    assert follower._background(room.frame({0: 60}), window) is dark
+    assert follower._background(room.frame({0: 60}), [(1100, 1200)]) is None  # it is not there
+    assert follower._background(room.frame({0: 60})) is dark
+    assert follower._background(room.frame({0: 60}, sh_period=200), window) is None
+    lamps.append((1003.0, 20_000.0))
+    assert follower._background(room.frame({0: 60}), window) is dark
+    for moved in ([], [(1003.0, 30_000.0)], [(996.0, 30_000.0)], [(1000.0, 20_000.0)]):
+        lamps[:] = moved
+        assert follower._background(room.frame({0: 60}), window) is None
+    lamps[:] = []
+    follower.update(room.frame({}))
+    assert follower._background(room.frame({0: 60})) is None  # nothing to subtract
+
+
+def test_what_hides_a_spikes_place_widens_it() -> None:
+    """A reflection beside it while there is no gate, and the end of the line."""
+    follower = tracker(TWO)
+    plain = Spike(1500.0, 0.02, 40.0, 3e4)
+    for position, flags in ((1500.0, SpikeFlags.REFLECTION), (25.0, SpikeFlags.NONE)):
+        judged = follower._judged(0, replace(plain, position=position, flags=flags))
+        assert judged.flags & (SpikeFlags.DOUBLE | SpikeFlags.CLIPPED)
+    assert follower._judged(0, plain) == plain
+    caustic = replace(plain, flags=SpikeFlags.DOUBLE)
+    assert follower._judged(0, caustic) == plain
+    wide = replace(caustic, width=80.0)
+    assert follower._judged(0, wide) == wide
+    Room(TWO, rest(120.0, 1700.0)).run(follower, 20)
+    assert follower.locked
+    reflected = replace(plain, flags=SpikeFlags.REFLECTION)
+    assert follower._judged(0, reflected) == reflected
 
 
 # --- loss and recovery ----------------------------------------------------------------------------
@@ -353,6 +419,7 @@ def test_an_led_that_the_map_lacks_is_an_error() -> None:
         (LedMap([3], [[0.0, 0.0]]), {}, "1 LED in the map: a pose needs two"),
         (TWO, {"heading": Prior(0.0, 0.1)}, "sigma of heading = 0.1: allowed is 0"),
         (TWO, {"heading": Prior(0.0, math.inf)}, "two LEDs do not tell the heading"),
+        (TWO, {"unlit_every": 1}, "unlit_every = 1: allowed are 2 and more"),
     ],
 )
 def test_what_tells_no_pose_is_refused(leds: LedMap, options: dict[str, Any], message: str) -> None:
@@ -396,7 +463,9 @@ def test_the_first_command_has_the_schedules_periods() -> None:
     command = first_command(follower, count=7)
     assert (command.sh_period, command.icg_period, command.count) == (400, 16000, 7)
     assert command.mode is Mode.STREAM
-    assert all(len(lit) == 1 for lit in command.sequence)  # blind: one by one
+    assert [len(lit) for lit in command.sequence] == [0, 1, 1, 1]  # blind: one by one
+    spikes = first_command(tracker(NINE), spikes=True)
+    assert all(len(lit) == 1 for lit in spikes.sequence)
     assert first_command(tracker(NINE)).icg_period == ICG
 
 
@@ -407,7 +476,7 @@ def test_the_first_command_has_the_schedules_periods() -> None:
 def walk() -> tuple[Any, Calibration]:
     """A room in which the tracker walks, and what is known of it: the drawing and the plan."""
     room = load_room("walk")
-    return room, Calibration.nominal(DESIGNS["slit-4mm"], LedMap(*room.known_leds()))
+    return room, Calibration(nominal_camera(DESIGNS["slit-4mm"]), LedMap(*room.known_leds()))
 
 
 @pytest.mark.parametrize(
@@ -429,11 +498,9 @@ def test_a_walk_through_the_firmware(
                 there.append(link.machine.seconds)
             assert capture.statistics.good == 150
             assert capture.statistics.dropped == 0
-        transfers = link.machine.readouts["transfer"] / CLOCK
+        begin = link.clock_offset
     assert isinstance(steps[0].frame, SpikeFrame if spikes else Frame)
     times = np.array([s.t_ns for s in steps]) * 1e-9
-    ahead = transfers - times[-1]
-    begin = ahead[ahead > 0].min()  # of the device's clock, within a read-out of power-on
     assert (np.array(there) - begin - times).max() < latest
     known = [s for s in steps if s.estimate]
     assert len(known) > 120
@@ -447,6 +514,7 @@ def test_a_walk_through_the_firmware(
     assert (np.abs(errors) < 4 * np.array(sigmas)).all()
     assert (np.abs(errors).max(axis=0) < (12, 4, 4e-3)).all()
     # once a pose is known, three LEDs a frame, and nearly all of them are found
-    found = [i.outcome for s in known[20:] for i in s.innovations]
-    assert len(found) > 2.5 * len(known[20:])
+    lit = [s for s in known[20:] if s.lit]
+    found = [i.outcome for s in lit for i in s.innovations]
+    assert len(found) > 2.5 * len(lit)
     assert np.mean([outcome is Outcome.USED for outcome in found]) > 0.95
