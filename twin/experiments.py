@@ -19,12 +19,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, get_args
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from acquisition.capture import Capture, capture
 from acquisition.protocol import Command, Mode
-from raytransfer import TCD1304, OpticalSystem, prototype_head, telecentric_pair
+from raytransfer import TCD1304, OpticalSystem, plots, prototype_head, telecentric_pair
 from raytransfer.casting import cast_rays
-from raytransfer.designs import DESIGNS
+from raytransfer.designs import DESIGNS, Design
 from raytransfer.heads import Head
 from tracking.baseline import positions
 from tracking.calibration import Calibration, Observation, bundle
@@ -40,10 +41,13 @@ from tracking.evaluation import (
     resolution,
 )
 from tracking.leds import LedMap
-from tracking.poses import UNKNOWN, Prior, locate, optical
+from tracking.nominal import nominal_camera
+from tracking.plots import plot_errors, plot_path
+from tracking.poses import UNKNOWN, Estimate, Prior, locate, optical
 from tracking.spikes import Correction, Spike, SpikeFinder, SpikeFlags
-from twin.charts import Lane, spans
+from tracking.tracker import Tracker, default_schedule, first_command, follow
 from twin.link import TwinLink
+from twin.rooms import load_room
 from twin.world import Led, Pose, World
 
 if TYPE_CHECKING:
@@ -706,18 +710,89 @@ class Timing(NamedTuple):
 
 
 def streamed(frames: int = 60) -> Timing:
-    """Time the stream, with the pins of the microcontroller as the clock."""
-    with TwinLink(record=True) as link:
+    """Time the stream in virtual time."""
+    with TwinLink() as link:
         stamps, arrivals = [], []
         for frame in capture(link, _command([{0: SURVEY}], frames)):
             arrivals.append(link.machine.seconds)
             stamps.append((frame.timestamp or 0) * 1e-9)
-        read = spans(link.machine, Lane("ADC", "", gap=1e-4))[0, 0]
-        gates = spans(link.machine, Lane("ICG", ""))[:, 0]
-    # the device's clock starts with its firmware; the first frame's exposure ends with the gate
-    begun = gates[gates < read][-1] - stamps[0]
-    took = latency(np.array(arrivals) - np.array(stamps) - begun)
+        took = latency(np.array(arrivals) - np.array(stamps) - link.clock_offset)
     return Timing((frames - 1) / (stamps[-1] - stamps[0]), took.median)
+
+
+class Followed(NamedTuple):
+    """A tracker that moves, followed through the firmware.
+
+    Attributes
+    ----------
+    leds : LedMap
+        As planned; the room's stand a little off.
+    estimates : list of Estimate
+    truth : ndarray, shape (N, 3)
+        x and y in mm and heading in rad at the times of the estimates.
+    rate : float
+        Poses a second.
+    latency : float
+        Median from the end of an exposure until the pose, virtual s.
+    """
+
+    leds: LedMap
+    estimates: list[Estimate]
+    truth: NDArray[np.float64]
+    rate: float
+    latency: float
+
+    @property
+    def errors(self) -> NDArray[np.float64]:
+        """Estimates minus truth, shape (N, 3)."""
+        found = [(e.x, e.y, e.heading) for e in self.estimates]
+        return np.array(found) - self.truth
+
+    def __str__(self) -> str:
+        x, y, heading = np.sqrt((self.errors**2).mean(axis=0))
+        return (
+            f"a moving tracker, {len(self.estimates)} poses, {self.rate:.1f} a second, "
+            f"{self.latency * 1e3:.1f} ms after each exposure: RMS error x {x:.2f} mm, "
+            f"y {y:.2f} mm, heading {heading * 1e3:.2f} mrad"
+        )
+
+
+UNHURRIED: Final = 16000
+"""ICG period at which no whole frame waits for the link."""
+
+
+def followed(name: str = "walk", *, frames: int = 500, spikes: bool = False) -> Followed:
+    """Follow the tracker of a room, which knows the drawing of its head and the plan of the LEDs.
+
+    Parameters
+    ----------
+    name : str
+        Of a room, or its file.
+    frames : int
+    spikes : bool
+        The firmware finds the spikes; else whole frames are sent.
+    """
+    place = load_room(name)
+    leds = LedMap(*place.known_leds())
+    head = Design(place.world.head, place.world.sensor)
+    schedule = default_schedule(leds, icg_period=14800 if spikes else UNHURRIED)
+    tracker = Tracker(Calibration(nominal_camera(head), leds), schedule=schedule)
+    command = first_command(tracker, count=frames, spikes=spikes)
+    estimates, arrivals = [], []
+    with TwinLink(place.world, seed=place.seed) as link, Capture(link, command) as frames_in:
+        for step in follow(frames_in, tracker):
+            if step.estimate is not None:
+                estimates.append(step.estimate)
+                arrivals.append(link.machine.seconds)
+        times = np.array([e.t_ns * 1e-9 for e in estimates]) + link.clock_offset
+    poses = [place.world.pose(float(t)) for t in times]
+    return Followed(
+        leds,
+        estimates,
+        np.array([(p.x, p.y, p.heading) for p in poses]),
+        (len(times) - 1) / (times[-1] - times[0]),
+        latency(np.array(arrivals) - times).median,
+    )
 
 
 EXPOSURES: Final = 64
@@ -964,7 +1039,7 @@ def gravity_moves(head: OpticalSystem, distance: float) -> tuple[Move, Move]:
 
 
 def main() -> int:
-    """Print the tables, and write them into a file."""
+    """Print the tables, follow a tracker that moves, and write both into files."""
     parser = argparse.ArgumentParser(prog="python -m twin.experiments", description=__doc__)
     parser.add_argument(
         "--output", type=Path, default=Path("build"), metavar="FOLDER", help="default: build"
@@ -974,15 +1049,31 @@ def main() -> int:
     found = evaluate(seed=arguments.seed)
     text = f"{comparison(found)}\n\n{NOTES}\n\n{causes(found)}\n"
     sys.stdout.write(text)
+    path = followed()
+    sys.stdout.write(f"\n{path}\n")
     try:
         arguments.output.mkdir(parents=True, exist_ok=True)
-        path = arguments.output / "evaluation.txt"
-        path.write_text(text, encoding="utf-8")
+        tables, picture = arguments.output / "evaluation.txt", arguments.output / "follow.png"
+        tables.write_text(f"{text}\n{path}\n", encoding="utf-8")
+        _draw(path).savefig(picture)
     except OSError as error:
         sys.stderr.write(f"{arguments.output} cannot be written: {error.strerror}\n")
         return 1
-    sys.stdout.write(f"\nwritten: {path}\n")
+    sys.stdout.write(f"written: {tables}, {picture}\n")
     return 0
+
+
+def _draw(path: Followed) -> Figure:
+    """True and estimated path, and the errors over time."""
+    plots.style()
+    fig = Figure(figsize=(11, 6), layout="constrained")
+    places = fig.subplot_mosaic([["path", "x"], ["path", "y"], ["path", "heading"]])
+    plot_path(path.leds, path.estimates, places["path"], path.truth[:, :2]).legend()
+    axes = [places[name] for name in ("x", "y", "heading")]
+    sigmas = [np.sqrt(np.diag(e.covariance)) for e in path.estimates]
+    plot_errors([e.t_ns * 1e-9 for e in path.estimates], path.errors, sigmas, axes)
+    axes[0].legend(loc="upper right", ncols=2)
+    return fig
 
 
 if __name__ == "__main__":
