@@ -11,13 +11,13 @@ INPUTS := environment.txt constraints.txt pyproject.toml
 
 help:
 	@echo "make setup      build $(VENV) from environment.txt, install the project, compile firmware and twin"
-	@echo "make run        all studies: table, figures, build/report.html; a capture with the twin"
+	@echo "make run        all studies: tables, figures, build/report.html; a capture; a moving tracker followed"
 	@echo "make test       linters, unit tests, every notebook"
 	@echo "make lab        open the notebooks in JupyterLab"
 	@echo "make notebooks  execute the notebooks again, in place, byte-reproducibly"
 	@echo "make bench      speed, beside other packages; table and build/bench.json"
 	@echo "make agreement  exact rays beside two other tracers, ray by ray"
-	@echo "make soak       faults on the twin's link, many more than make test tries"
+	@echo "make soak       link faults, tracking for 10 min through the firmware and for 24 h: takes hours"
 	@echo "make flash      copy the firmware to a Nucleo that is plugged in"
 
 # install FOLDER, ARGUMENTS: uv where it can be had (faster), pip otherwise
@@ -54,6 +54,7 @@ run: setup
 	$(BIN)/linetrack plot build/output00001.dat build/output00002.dat --save build/output.png
 	$(BIN)/linetrack live --link replay build/output --frames 2
 	@echo "the chart as a picture: build/output.png"
+	$(BIN)/python -m twin.experiments --output build
 
 test: setup lint
 	$(BIN)/python -m pytest
@@ -79,8 +80,11 @@ bench: $(BENCH_STAMP) build
 agreement: $(BENCH_STAMP)
 	$(BENCH)/bin/python -W ignore -m benchmarks.agreement
 
+# link faults, then tracking: 10 virtual minutes through the firmware, 24 h of simulated spikes
 soak: setup
 	$(BIN)/python -m tests.twin.soak
+	$(BIN)/python -m tests.twin.endurance --minutes 10
+	$(BIN)/python -m tests.tracking.endurance --hours 24
 
 flash: setup
 	@$(MAKE) --no-print-directory -C firmware flash

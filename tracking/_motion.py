@@ -248,6 +248,28 @@ def fit(state, prior, doubt, ages, rows, pixels, variances, leds, lens, informat
 
 
 @_compile
+def fluxes(x, y, leds, normals, gains, common, weights):
+    """Electrons in the peak of each LED per clock: gain × cosine / distance^1.5, 0 from behind.
+
+    Gains are logarithms; a weight says how far one's own counts, and not the common one.
+    """
+    out = np.zeros(len(leds))
+    for n in range(len(leds)):
+        east, north = x - leds[n, 0], y - leds[n, 1]
+        facing = east * normals[n, 0] + north * normals[n, 1]
+        if facing > 0.0:
+            gain = math.exp(common + weights[n] * (gains[n] - common))
+            out[n] = facing * gain * (east * east + north * north + 1.0) ** -1.25
+    return out
+
+
+@_compile
+def fading(times, seconds, constant):
+    """What is left at a time of what was learnt at earlier times: 1 of the present, 0 of never."""
+    return np.exp(np.minimum(times - seconds, 0.0) / constant)
+
+
+@_compile
 def inside(pixel, variance, last):
     """Probability that a spike is on the line, of pixels 0 to last."""
     if math.isnan(pixel):

@@ -31,9 +31,12 @@ if TYPE_CHECKING:
 
 # enumerations are slow: inside, flags are whole numbers
 _FLAGS = tuple(PoseFlags(n) for n in range(2 * max(PoseFlags)))
-_PREDICTED, _LOST, _REJECTED, _INCONSISTENT = (
+_PREDICTED, _LOST, _RELOCALISED, _REJECTED, _INCONSISTENT = (
     int(flag)
-    for flag in (PoseFlags.PREDICTED, PoseFlags.LOST, PoseFlags.REJECTED, PoseFlags.INCONSISTENT)
+    for flag in (
+        *(PoseFlags.PREDICTED, PoseFlags.LOST, PoseFlags.RELOCALISED),
+        *(PoseFlags.REJECTED, PoseFlags.INCONSISTENT),
+    )
 )
 _UNCERTAIN = int(SpikeFlags.CLIPPED | SpikeFlags.DOUBLE)
 _MISSING = int(SpikeFlags.MISSING)
@@ -68,6 +71,11 @@ MANY = 5
 """LEDs that are believed wherever they say that the tracker is."""
 CONFIRMATIONS = 3
 """Spikes that must agree with a pose that was found before it counts."""
+
+DOUBT = 5.0
+"""Uncertainty of a prediction from which on a spike may be a reflection that comes in handy, px."""
+NEEDED = 3
+"""LEDs that some pose fits, whatever they say."""
 
 
 class Outcome(IntEnum):
@@ -270,6 +278,9 @@ class MotionFilter:
         self._to_confirm = 0
         self._tries = 0
         self._flags = 0
+        self._doubt = 0  # flags of a pose that too few LEDs speak for …
+        self._witnesses: frozenset[int] = frozenset()  # … and these
+        self._refused: set[int] = set()  # since any spike was beyond doubt
         self.lost = True
         self.losses = 0
         self.stale = 0
@@ -289,6 +300,16 @@ class MotionFilter:
     def covariance(self) -> NDArray[np.float64]:
         """Of `state`, shape (8, 8). A copy."""
         return self._cov.copy()
+
+    @property
+    def doubt(self) -> PoseFlags:
+        """Flags that `estimate` sets until a further LED agrees with the pose; 0 is none.
+
+        RELOCALISED: the pose was found with three LEDs, which fit some pose even if one of them is
+        a reflection. PREDICTED: after a time without, spikes of one LED alone passed, which might
+        have been anything near; or it passed after it had been refused.
+        """
+        return _FLAGS[self._doubt]
 
     def start(self, fix: Fix, t_ns: int) -> None:
         """Begin at a pose; its rates are unknown.
@@ -314,7 +335,8 @@ class MotionFilter:
             np.diag([0.0] * 3 + [speed**2, speed**2, turning**2]),
         )
         self._cov[:3, :3] = fix.covariance
-        self._lock()
+        self._witnesses = frozenset()
+        self._lock(0)
 
     def _begin(self, t_ns: int, motion: Any, covariance: NDArray[np.float64]) -> None:
         self._t = int(t_ns)
@@ -325,8 +347,10 @@ class MotionFilter:
         self._cov[:6, :6] = covariance
         self._cov[6, 6], self._cov[7, 7] = self._height.sigma**2, self._bias.sigma**2
 
-    def _lock(self) -> None:
+    def _lock(self, doubt: int) -> None:
         self.lost = False
+        self._doubt = doubt
+        self._refused.clear()
         self._used_ns = self._t
         self._recent = 0
         self._mean_nis = 1.0
@@ -372,11 +396,12 @@ class MotionFilter:
         if t_ns < self._t or (t_ns == self._t and channel in self._seen):
             self.stale += 1
             return self._note(t_ns, channel, Outcome.STALE)
-        self.predict(t_ns)
+        if t_ns > self._t:
+            self.predict(t_ns)
         self._seen.add(channel)
         if gyro is not None:
             self._turn(*gyro)
-        flags = spike.flags.value
+        flags = int(spike.flags)
         if flags & _MISSING:
             self._judge()
             return self._note(t_ns, channel, Outcome.MISSING)
@@ -395,10 +420,12 @@ class MotionFilter:
         self._recent = self._recent << 1 & _HISTORY
         if outcome is Outcome.USED:
             self._used_ns = self._t
-            if not self._recent:
+            self._believe(row, scale - variance > DOUBT**2)
+            if not self._recent and not self._doubt:
                 self._trusted = (self._t, *self._state[:3].tolist())
         else:
             self._recent |= 1
+            self._refused.add(row)
             self._flags |= _REJECTED
         if outcome is not Outcome.UNSEEN:
             nis = min(residual * residual / scale, self._gate)
@@ -448,8 +475,7 @@ class MotionFilter:
         """
         state, cov, t_ns = self._at(t_ns)
         flags = self._flags
-        if self.lost:
-            flags |= _LOST
+        flags |= _LOST if self.lost else self._doubt
         if t_ns > self._used_ns:
             flags |= _PREDICTED
         if self._mean_nis > INFLATED:
@@ -580,6 +606,16 @@ class MotionFilter:
         self.innovations.append(innovation)
         return innovation
 
+    def _believe(self, row: int, doubtful: bool) -> None:
+        """Find out whether a spike that passed the gate speaks for the pose, or was easy to please."""
+        if doubtful or row in self._refused:
+            if not self._doubt:
+                self._doubt, self._witnesses = _PREDICTED, frozenset([row])
+            return
+        self._refused.clear()
+        if row not in self._witnesses:
+            self._doubt = 0
+
     def _judge(self) -> None:
         """Find out whether lock is lost."""
         if self.lost:
@@ -610,9 +646,11 @@ class MotionFilter:
             if outcome is Outcome.USED:
                 self._used_ns = t_ns
                 self._to_confirm -= 1
+                if scale - variance <= DOUBT**2:
+                    self._witnesses |= {row}
                 if not self._to_confirm:
-                    self._lock()
-                    self._flags = int(PoseFlags.RELOCALISED)
+                    self._lock(_RELOCALISED if len(self._witnesses) <= NEEDED else 0)
+                    self._flags = _RELOCALISED
             elif self._tries >= 2 * CONFIRMATIONS:
                 self._to_confirm = 0
             return self._note(t_ns, channel, outcome, predicted, residual, math.sqrt(scale))
@@ -711,6 +749,7 @@ class MotionFilter:
                 continue
             self._begin(self._t, state[:6], covariance)
             self._seen = {int(rows[-1])}
+            self._witnesses = frozenset(rows[use].tolist())
             return True
         return False
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from tracking.motion import MotionFilter
     from tracking.spikes import Spike
 
-_MISSING, _SATURATED = SpikeFlags.MISSING.value, SpikeFlags.SATURATED.value
+_MISSING, _SATURATED = int(SpikeFlags.MISSING), int(SpikeFlags.SATURATED)
 
 FORGETTING = 1.0
 """Time after which little is left of what was learnt of an LED, s."""
@@ -92,6 +92,7 @@ class ExposureControl:
         self._learnt = np.full(len(leds), -math.inf)  # when, s
         self._normals = np.column_stack([-np.sin(leds.facings), np.cos(leds.facings)])
         self._rows = {channel: row for row, channel in enumerate(leds.channels)}
+        self._kernels = load_kernels()
 
     def fluxes(self, x: float, y: float, seconds: float) -> NDArray[np.float64]:
         """Electrons in the peak of each LED per clock, for a tracker at x, y (mm); 0 from behind.
@@ -102,17 +103,18 @@ class ExposureControl:
         seconds : float
             Time, by which what was learnt is weighed.
         """
-        away = np.array([x, y]) - self.leds.positions[:, :2]
-        square = np.einsum("ij,ij->i", away, away) + 1.0
-        facing = np.einsum("ij,ij->i", away, self._normals)
-        weight = np.exp(np.minimum(self._learnt - seconds, 0.0) / FORGETTING)
-        gains = np.exp(self._common + weight * (self._gains - self._common))
-        return np.asarray(np.maximum(facing, 0.0) * gains * square**-1.25)
+        weights = self._kernels.fading(self._learnt, seconds, FORGETTING)
+        return np.asarray(
+            self._kernels.fluxes(
+                *(float(x), float(y), self.leds.positions, self._normals),
+                *(self._gains, self._common, weights),
+            )
+        )
 
     def clocks(self, fluxes: NDArray[np.float64]) -> NDArray[np.float64]:
         """Exposures for these `fluxes`, master clocks."""
-        with np.errstate(divide="ignore"):
-            return np.asarray(np.clip(self.peak / fluxes, EXPOSURE_MIN, self.sh_period))
+        least = self.peak / self.sh_period  # what is dimmer is lit for as long as may be
+        return np.asarray(np.maximum(self.peak / np.maximum(fluxes, least), EXPOSURE_MIN))
 
     def learn(self, channel: int, clocks: int, spike: Spike, flux: float, seconds: float) -> None:
         """Take in how high an LED's spike was.
@@ -132,7 +134,7 @@ class ExposureControl:
         row = self._rows[channel]
         weight = math.exp(min(self._learnt.item(row) - seconds, 0.0) / FORGETTING)
         gain = self._common + weight * (self._gains.item(row) - self._common)
-        flags = spike.flags.value
+        flags = int(spike.flags)
         if flags & _MISSING:  # too dim, perhaps; or something is in the way
             gain = max(gain - 0.2, self._common - 2.0)
         elif flags & _SATURATED:
@@ -236,9 +238,9 @@ class Schedule:
             )
         start = t_ns + (self.latency + 1) * self.period_ns
         seconds = start * 1e-9
-        state = motion.state
+        x, y, _, speed_x, speed_y, *_ = motion.state.tolist()
         ahead = max(start - motion.t_ns, 0) * 1e-9
-        x, y = state[0] + ahead * state[3], state[1] + ahead * state[4]
+        x, y = x + ahead * speed_x, y + ahead * speed_y
         self._fluxes = self.exposure.fluxes(x, y, seconds)
         clocks = self.exposure.clocks(self._fluxes)
         if motion.lost:
@@ -271,7 +273,7 @@ class Schedule:
         for channel, spike in spikes.items():
             row = self._rows[channel]
             self.exposure.learn(channel, lit[channel], spike, self._fluxes.item(row), seconds)
-            if not spike.flags.value & _MISSING:
+            if not int(spike.flags) & _MISSING:
                 self._chances[row] = 1.0
             else:
                 left = math.exp(min(self._judged.item(row) - seconds, 0.0) / FORGETTING)
@@ -281,7 +283,7 @@ class Schedule:
 
     def chances(self, seconds: float) -> NDArray[np.float64]:
         """Chance of each LED to be found where it should be seen, from whether it was lately."""
-        left = np.exp(np.minimum(self._judged - seconds, 0.0) / FORGETTING)
+        left = self._kernels.fading(self._judged, seconds, FORGETTING)
         return np.asarray(1.0 - (1.0 - self._chances) * left)
 
     def _plan(
@@ -373,8 +375,7 @@ class Greedy(Schedule):
     ) -> list[NDArray[np.int64]]:
         peaks = self._fluxes * clocks
         usable = (peaks > 0) & (peaks < 2 * self.exposure.peak)
-        with np.errstate(divide="ignore"):
-            variances = self.sigma**2 * np.maximum(self.exposure.peak / peaks, 1.0)
+        variances = self.sigma**2 * np.maximum(self.exposure.peak / np.maximum(peaks, 1e-9), 1.0)
         chosen = np.empty((frames, self.per_frame), np.int64)
         motion.choose(
             start,

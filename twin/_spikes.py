@@ -119,7 +119,7 @@ def visible(seed, t, pose, leds, normals, rates, table, last, faults, seconds, l
 @_compile
 def expose(
     seed,
-    random,
+    draws,
     t,
     pose,
     leds,
@@ -136,7 +136,8 @@ def expose(
 ):
     """What a finder says of a frame in which the LEDs `rows` are lit for `seconds`.
 
-    One row of out for each window: position, sigma, width, height, flags.
+    One row of out for each window: position, sigma, width, height, flags. Draws has a row of random
+    numbers for each LED, two normal ones and three from 0 to 1.
     """
     count = len(rows)
     fields = np.empty(5)
@@ -179,7 +180,7 @@ def expose(
             if min(position, last - position) < width:
                 flags |= CLIPPED
             row = there[found]
-            row[0] = position + sigma * random.standard_normal()
+            row[0] = position + sigma * draws[k, kind]
             row[1] = sigma
             row[2] = width
             row[3] = seen
@@ -218,6 +219,6 @@ def expose(
         if second >= 0 and abs(there[best, 0] - there[second, 0]) < 4.0 * there[best, 2]:
             flags |= REFLECTION
         out[k, 4] = flags
-        if random.random() < noise[3]:  # a gross error, of which the finder knows nothing
-            off = 5.0 + 295.0 * random.random()
-            out[k, 0] += off if random.random() < 0.5 else -off
+        if draws[k, 2] < noise[3]:  # a gross error, of which the finder knows nothing
+            off = 5.0 + 295.0 * draws[k, 3]
+            out[k, 0] += off if draws[k, 4] < 0.5 else -off

@@ -337,7 +337,7 @@ class Reading(NamedTuple):
 
 
 BLOCK = 4096
-"""Frames whose poses are computed at once."""
+"""Frames whose poses are computed at once, and LEDs for which random numbers are drawn at once."""
 
 
 class SpikeWorld:
@@ -407,6 +407,8 @@ class SpikeWorld:
         self._noise = np.array([self._least, full, check.positive("scale", scale), f.gross])
         self._seed = check.whole("seed + 1", seed + 1)
         self._random = np.random.default_rng(seed)
+        self._draws = np.empty((0, 5))
+        self._drawn = 0
         self._late: list[tuple[int, Reading]] = []
         self._block = -1
         self._poses = np.empty((0, 3))
@@ -474,7 +476,7 @@ class SpikeWorld:
         out = np.empty((len(rows), 5))
         self._kernels.expose(
             self._seed,
-            self._random,
+            self._draw(len(rows)),
             self.time_ns(frame) * 1e-9,
             self.pose(frame),
             self._positions,
@@ -495,6 +497,15 @@ class SpikeWorld:
                 lit, out.tolist(), strict=True
             )
         }
+
+    def _draw(self, count: int) -> NDArray[np.float64]:
+        """Two normal and three uniform random numbers for so many LEDs."""
+        if self._drawn + count > len(self._draws):
+            normal = self._random.standard_normal((BLOCK, 2))
+            self._draws = np.hstack([normal, self._random.random((BLOCK, 3))])
+            self._drawn = 0
+        self._drawn += count
+        return self._draws[self._drawn - count : self._drawn]
 
     def receive(
         self,

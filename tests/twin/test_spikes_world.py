@@ -1,4 +1,5 @@
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,16 +19,16 @@ NEVER = Faults.none()
 class Still:
     """A path that stays where it is."""
 
-    def __init__(self, x, y, heading=0.0):
+    def __init__(self, x: Any, y: Any, heading: Any = 0.0) -> None:
         self.pose = np.array([x, y, heading])
 
-    def at(self, seconds):
+    def at(self, seconds: Any) -> Any:
         return np.tile(self.pose, (len(seconds), 1))
 
 
-def world(leds, path=None, **options):
+def world(leds: Any, path: Any = None, **options: Any) -> Any:
     table, _ = head()
-    options = {"faults": NEVER, "seed": 1} | options
+    options = {"faults": NEVER, "seed": 1, **options}
     path = Still(0.0, 3000.0) if path is None else path
     return SpikeWorld(leds, table, path, sh_period=SH_PERIOD, icg_period=ICG_PERIOD, **options)
 
@@ -36,7 +37,7 @@ def world(leds, path=None, **options):
 
 
 @pytest.mark.parametrize(("degrees", "distance"), [(3.3, 1700.0), (-14.2, 3300.0), (19.7, 900.0)])
-def test_between_its_points_the_table_is_exact_light(degrees, distance):
+def test_between_its_points_the_table_is_exact_light(degrees: Any, distance: Any) -> None:
     table, _ = head()
     m = math.tan(math.radians(degrees))
     light = irradiance(
@@ -59,13 +60,13 @@ def test_between_its_points_the_table_is_exact_light(degrees, distance):
     assert light.max() == pytest.approx(expected, rel=0.25)
 
 
-def test_beyond_the_line_there_is_nothing():
+def test_beyond_the_line_there_is_nothing() -> None:
     table, _ = head()
     assert math.isnan(table.spike(0.6, 2000.0)[0])
     assert math.isnan(table.spike(0.52, 2000.0)[0])
 
 
-def test_refuses_distances_out_of_order():
+def test_refuses_distances_out_of_order() -> None:
     with pytest.raises(ValueError, match="nearest"):
         SpikeTable(DESIGNS["slit-4mm"].system, nearest=2000.0, farthest=1000.0)
 
@@ -73,7 +74,7 @@ def test_refuses_distances_out_of_order():
 # -- noise, exposure
 
 
-def test_positions_scatter_as_stated_about_the_exact_place():
+def test_positions_scatter_as_stated_about_the_exact_place() -> None:
     table, _ = head()
     place = world([Led(0, (400.0, 0.0, 0.0), power=0.25)])
     found = [place.expose(n, {0: 30})[0] for n in range(2000)]
@@ -86,7 +87,7 @@ def test_positions_scatter_as_stated_about_the_exact_place():
     assert all(s.flags == SpikeFlags.NONE for s in found)
 
 
-def test_longer_is_better_until_it_saturates():
+def test_longer_is_better_until_it_saturates() -> None:
     place = world([Led(0, (0.0, 0.0, 0.0), power=0.25)])
     spikes = [place.expose(0, {0: clocks})[0] for clocks in (5, 10, 20, 40)]
     heights = np.array([s.height for s in spikes])
@@ -99,7 +100,7 @@ def test_longer_is_better_until_it_saturates():
     assert full.height < 36_000
 
 
-def test_dim_hidden_and_averted_leds_are_missing():
+def test_dim_hidden_and_averted_leds_are_missing() -> None:
     leds = [
         Led(0, (0.0, 0.0, 0.0), power=1e-5),
         Led(1, (0.0, 0.0, 0.0), power=0.25, facing=math.pi),
@@ -114,7 +115,7 @@ def test_dim_hidden_and_averted_leds_are_missing():
     assert place.visible(0) == 1
 
 
-def test_windows_tell_whose_spike_it_is():
+def test_windows_tell_whose_spike_it_is() -> None:
     leds = [Led(0, (-400.0, 0.0, 0.0), power=0.25), Led(1, (400.0, 0.0, 0.0), power=0.1)]
     place = world(leds)
     alone = {n: place.expose(0, {n: 60})[n].position for n in (0, 1)}
@@ -129,7 +130,7 @@ def test_windows_tell_whose_spike_it_is():
     assert not swapped[1].found
 
 
-def test_spikes_that_touch_are_one():
+def test_spikes_that_touch_are_one() -> None:
     leds = [Led(0, (0.0, 0.0, 0.0), power=0.25), Led(1, (5.0, 0.0, 0.0), power=0.25)]
     both = world(leds).expose(0, {0: 40, 1: 40})
     assert both[0].flags & SpikeFlags.DOUBLE
@@ -138,34 +139,34 @@ def test_spikes_that_touch_are_one():
 # -- what goes wrong
 
 
-def share(faults, what, frames=40_000):
+def share(faults: Any, what: Any, frames: Any = 40_000) -> Any:
     place = world([Led(0, (0.0, 0.0, 0.0), power=0.25)], faults=faults, seed=2)
     return np.mean([what(place.expose(n, {0: 40})[0]) for n in range(frames)])
 
 
-def off(**options):
+def off(**options: Any) -> Any:
     return Faults(**{**NEVER.__dict__, **options})
 
 
-def test_leds_are_hidden_as_often_as_asked():
+def test_leds_are_hidden_as_often_as_asked() -> None:
     part = share(off(blocked_every=4.0, blocked=0.5), lambda s: not s.found)
     assert part == pytest.approx(0.125, rel=0.35)
     part = share(off(dark_every=4.0, dark=0.5), lambda s: not s.found)
     assert part == pytest.approx(0.125, rel=0.35)
 
 
-def test_gross_errors_come_as_often_as_asked():
+def test_gross_errors_come_as_often_as_asked() -> None:
     part = share(off(gross=0.01), lambda s: abs(s.position - 1823.56) > 4)
     assert part == pytest.approx(0.01, rel=0.3)
 
 
-def test_reflections_are_found_where_the_led_is_hidden():
+def test_reflections_are_found_where_the_led_is_hidden() -> None:
     faults = off(mirror_every=4.0, mirror=2.0, blocked_every=4.0, blocked=2.0)
     part = share(faults, lambda s: s.found and abs(s.position - 1823.56) > 25)
     assert 0.05 < part < 0.35
 
 
-def test_the_same_seed_is_the_same_world_whatever_is_lit():
+def test_the_same_seed_is_the_same_world_whatever_is_lit() -> None:
     leds = [Led(n, (100.0 * n, 0.0, 0.0), power=0.25) for n in range(4)]
     faults = Faults(blocked_every=3.0)
     one, other = (world(leds, faults=faults, seed=5) for _ in range(2))
@@ -178,7 +179,7 @@ def test_the_same_seed_is_the_same_world_whatever_is_lit():
     assert one.expose(1, {0: 40}) != world(leds, seed=6).expose(1, {0: 40})
 
 
-def test_frames_get_lost_late_and_twice():
+def test_frames_get_lost_late_and_twice() -> None:
     place = world([Led(0, (0.0, 0.0, 0.0))], faults=off(lost=0.1, late=0.1, twice=0.1), seed=3)
     arrived = [[reading.t_ns for reading in place.receive(n, {0: 40})] for n in range(5000)]
     times = [t for readings in arrived for t in readings]
@@ -193,7 +194,7 @@ def test_frames_get_lost_late_and_twice():
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_wander_stays_in_its_area_and_below_its_speed(seed):
+def test_wander_stays_in_its_area_and_below_its_speed(seed: Any) -> None:
     path = Wander(seed, (-4000.0, 4000.0, -3000.0, 4000.0), speed=1000.0, turning=1.0)
     times = np.arange(0, 600, 0.01)
     x, y, heading = path.at(times).T
@@ -206,7 +207,7 @@ def test_wander_stays_in_its_area_and_below_its_speed(seed):
     assert path(1.0) == pytest.approx(tuple(path.at(np.array([1.0]))[0]))
 
 
-def test_refuses_what_cannot_be():
+def test_refuses_what_cannot_be() -> None:
     with pytest.raises(ValueError, match="area"):
         Wander(0, (1.0, -1.0, 0.0, 1.0))
     with pytest.raises(ValueError, match="probability"):
@@ -222,7 +223,7 @@ def test_refuses_what_cannot_be():
 # -- endurance: an hour, 40 LEDs, everything that can go wrong
 
 
-def test_an_hour_of_everything():
+def test_an_hour_of_everything() -> None:
     report = run(1.0, seed=1)
     assert not report.failures(), str(report)
     assert report.losses > 20, "nothing happened"
@@ -230,7 +231,7 @@ def test_an_hour_of_everything():
     assert report.locked > 0.9 * report.frames
 
 
-def test_room_is_seen_from_anywhere():
+def test_room_is_seen_from_anywhere() -> None:
     leds = room()
     table, _ = head()
     for seed in range(3):
