@@ -225,7 +225,7 @@ class PoseBound:
     @property
     def sigma_x(self) -> float:
         """Standard deviation of x, mm."""
-        return math.sqrt(self.covariance[0, 0])
+        return float(np.sqrt(self.covariance[0, 0]))
 
     @property
     def sigma_y(self) -> float:
@@ -245,8 +245,8 @@ def pose_bound(
 
     Parameters
     ----------
-    jacobian : array_like, shape (N, 3)
-        Change of each spike's position, px, with the tracker's x and y (per mm) and heading
+    jacobian : array_like, shape (…, N, 3)
+        Of one pose or many: change of each spike's position, px, with the tracker's x and y (per mm) and heading
         (per rad), as from `pinhole_jacobian` or from differences of traced positions.
     sigma : array_like
         Standard deviation of each spike's position, px, shape (N,), or one for all; independent.
@@ -264,14 +264,15 @@ def pose_bound(
         If shapes do not match or a standard deviation is none.
     """
     rows = check.array("jacobian", jacobian)
-    if rows.ndim != 2 or rows.shape[1] != 3:
+    if rows.ndim < 2 or rows.shape[-1] != 3:
         raise ValueError(
-            f"jacobian has shape (N, 3), one row per LED, not {rows.shape}; is it transposed?"
+            f"jacobian has shape (…, N, 3), one row per LED, not {rows.shape}; is it transposed?"
         )
+    *poses, count, _ = rows.shape
     spread = np.asarray(sigma, dtype=float)
-    if spread.shape not in {(), (len(rows),)}:
+    if spread.shape not in {(), (count,)}:
         raise ValueError(
-            f"sigma is one number or one per LED, shape ({len(rows)},), not {spread.shape}"
+            f"sigma is one number or one per LED, shape ({count},), not {spread.shape}"
         )
     if not (spread > 0).all():
         wrong = spread[~(spread > 0)].flat[0]
@@ -280,12 +281,13 @@ def pose_bound(
         raise ValueError(
             f"sigma_heading = {sigma_heading}: allowed is 0 (known) to infinity (unknown)"
         )
-    rows = rows / np.broadcast_to(spread, len(rows))[:, None]
-    covariance = np.zeros((3, 3))
+    rows = rows / np.broadcast_to(spread, count)[:, None]
+    covariance = np.zeros((*poses, 3, 3))
     if sigma_heading == 0:
-        covariance[:2, :2] = _inverse(rows[:, :2])
+        covariance[..., :2, :2] = _inverse(rows[..., :2])
     else:
-        covariance[:] = _inverse(np.vstack([rows, [0.0, 0.0, 1 / sigma_heading]]))
+        known = np.broadcast_to([0.0, 0.0, 1 / sigma_heading], (*poses, 1, 3))
+        covariance[:] = _inverse(np.concatenate([rows, known], axis=-2))
     return PoseBound(covariance)
 
 
@@ -351,12 +353,16 @@ def _charge(name: str, electrons: ArrayLike) -> NDArray[np.float64]:
 
 def _inverse(rows: NDArray[np.float64]) -> NDArray[Any]:
     """Inverse of rowsᵀ rows, with infinities where a direction is not determined."""
-    norms = np.linalg.norm(rows, axis=0)
+    size = rows.shape[-1]
+    if (missing := size - rows.shape[-2]) > 0:
+        rows = np.concatenate([rows, np.zeros((*rows.shape[:-2], missing, size))], axis=-2)
+    norms = np.linalg.norm(rows, axis=-2, keepdims=True)
     norms[norms == 0] = 1
-    _, strength, basis = np.linalg.svd(rows / norms)
-    strength = np.pad(strength, (0, len(basis) - len(strength)))
-    told = strength > _UNDETERMINED * strength.max()
-    known = basis[told] / strength[told, None]
-    free = basis[~told].T @ basis[~told]
-    inverse = np.where(np.abs(free) > _UNDETERMINED, np.copysign(np.inf, free), known.T @ known)
-    return np.asarray(inverse / np.outer(norms, norms))
+    _, strength, basis = np.linalg.svd(rows / norms, full_matrices=False)
+    told = (strength > _UNDETERMINED * strength.max(axis=-1, keepdims=True))[..., None]
+    known = np.where(told, basis, 0.0) / np.where(told, strength[..., None], 1.0)
+    flat = np.where(told, 0.0, basis)
+    free = np.swapaxes(flat, -1, -2) @ flat
+    told_so = np.swapaxes(known, -1, -2) @ known
+    inverse = np.where(np.abs(free) > _UNDETERMINED, np.copysign(np.inf, free), told_so)
+    return np.asarray(inverse / (np.swapaxes(norms, -1, -2) * norms))

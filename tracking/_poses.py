@@ -1,7 +1,8 @@
 """Compiled pose estimation: bare arrays, no checks. `poses` stands on it.
 
 A pose is [x, y, heading]; height is given, and integrated over in `over_heights`. A heading with
-infinite `sharpness` (1/σ²) is known and stays as it is.
+infinite `sharpness` (1/σ²) is known and stays as it is. A row of `leds` is x, y, z and the normal
+of the side to which the LED shines, zeros if it may be seen from anywhere.
 """
 
 from __future__ import annotations
@@ -13,15 +14,19 @@ from numba import njit
 from numba.extending import register_jitable
 
 from raytransfer._kernels import CACHE
-from tracking import camera
+from tracking import camera, poses
 
 _compile = njit(cache=CACHE, error_model="numpy", nogil=True)
 
 shape = register_jitable(camera.shape)  # in place: so that image finds it
 image = _compile(camera.image)
+by_pose = _compile(poses.by_pose)
 
 LIKELY = 12.0
 """Heights whose log-likelihood is lower by more than this are left out."""
+
+FINE = 0.1
+"""Log-likelihood by which the cells beside a maximum may be lower."""
 
 CELLS = 512
 
@@ -112,6 +117,8 @@ def begin(c, leds, pixels, inverse, chosen, height, known, pose):
             for _ in range(camera.NEWTON_STEPS):
                 at, slope, _q = shape(c, value, q[k])
                 value -= (at - aim) / slope
+            if not slope > 0:  # beyond the field
+                return False
             m[k] = value
         if not closed_form(m, x, y, w, known, pupil):
             return False
@@ -122,6 +129,9 @@ def begin(c, leds, pixels, inverse, chosen, height, known, pose):
                 return False
             w[k] = sharp[k] / z
             q[k] = (rise[k] / (z - c[2] + c[3])) ** 2 / (1 + m[k] * m[k])
+    for i in range(len(pixels)):
+        if chosen[i] and _dark(leds[i], pupil):
+            return False
     # the centre of projection is behind the tracker's place
     pose[0] = pupil[0] + c[2] * sin
     pose[1] = pupil[1] - c[2] * cos
@@ -130,19 +140,23 @@ def begin(c, leds, pixels, inverse, chosen, height, known, pose):
 
 
 @_compile
+def _dark(led, pose):
+    """Whether an LED shines away from a place."""
+    return (led[0] - pose[0]) * led[3] + (led[1] - pose[1]) * led[4] > 0
+
+
+@_compile
 def expected(c, led, pose, height):
-    """Spike of an LED, its derivatives along x, y and heading, and the distance to the pupil."""
+    """Spike of an LED, its derivatives along x, y, heading and height, and the distance to the pupil.
+
+    The distance is not positive if no light comes from there.
+    """
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     dx, dy = led[0] - pose[0], led[1] - pose[1]
     across, distance = -cos * dx - sin * dy, sin * dx - cos * dy
-    u, by_x, _, by_z = image(c, across, led[2] - height, distance)
-    return (
-        u,
-        by_x * cos - by_z * sin,
-        by_x * sin + by_z * cos,
-        by_x * distance - by_z * across,
-        distance + c[2],
-    )
+    u, by_x, by_y, by_z = image(c, across, led[2] - height, distance)
+    ux, uy, up = by_pose(by_x, by_z, across, distance, cos, sin)
+    return u, ux, uy, up, -by_y, -math.inf if _dark(led, pose) else distance + c[2]
 
 
 @_compile
@@ -154,7 +168,7 @@ def _normal(c, leds, pixels, inverse, chosen, height, heading, sharpness, pose, 
     for i in range(len(pixels)):
         if not chosen[i]:
             continue
-        u, ux, uy, up, z = expected(c, leds[i], pose, height)
+        u, ux, uy, up, _, z = expected(c, leds[i], pose, height)
         if not z > 0:
             return math.inf
         r = (pixels[i] - u) * inverse[i]
@@ -183,8 +197,8 @@ def _normal(c, leds, pixels, inverse, chosen, height, heading, sharpness, pose, 
 
 @_compile
 def _cholesky(a, damping, low):
-    """Factor the symmetric 3 × 3 whose lower half is given, its diagonal raised."""
-    for i in range(3):
+    """Factor the symmetric matrix whose lower half is given, its diagonal raised."""
+    for i in range(len(a)):
         for j in range(i + 1):
             s = a[i, j] * (1 + damping) if i == j else a[i, j]
             for k in range(j):
@@ -271,14 +285,60 @@ def fit(c, leds, pixels, inverse, chosen, height, heading, sharpness, pose, cova
 
 
 @_compile
-def heading_seen(c, leds, inverse, chosen, height, pose):
-    """Part of the heading's information that no motion along x and y explains away, 0 to 1."""
-    a, g, none = np.zeros((3, 3)), np.zeros(3), np.zeros(len(inverse))
-    low = np.zeros((3, 3))
-    _normal(c, leds, none, inverse, chosen, height, 0.0, 0.0, pose, a, g)
+def judge(
+    c, leds, pixels, inverse, chosen, height, height_sharpness, sharpness, pose, residuals, left
+):
+    """Set the residuals of all spikes, px, and the part of each one's error that is left in its own.
+
+    The rest, of 1, goes into the pose. All is 0 where the pose is not determined.
+    """
+    a, low, rows = np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((len(leds), 4))
+    left[:] = 0.0
+    for i in range(len(leds)):
+        u, ux, uy, up, uh, z = expected(c, leds[i], pose, height)
+        residuals[i] = pixels[i] - u if z > 0 else math.nan
+        if chosen[i]:
+            rows[i] = (ux, uy, up, uh)
+            rows[i] *= inverse[i]
+            if math.isinf(sharpness):
+                rows[i, 2] = 0.0
+            if math.isinf(height_sharpness):
+                rows[i, 3] = 0.0
+            for j in range(4):
+                for k in range(j + 1):
+                    a[j, k] += rows[i, j] * rows[i, k]
+    a[2, 2] += 1.0 if math.isinf(sharpness) else sharpness
+    a[3, 3] += 1.0 if math.isinf(height_sharpness) else height_sharpness
     if not _cholesky(a, 0.0, low):
-        return 0.0
-    return low[2, 2] ** 2 / a[2, 2]
+        return
+    for i in range(len(leds)):
+        if chosen[i]:
+            left[i] = 1.0
+            for j in range(4):
+                for k in range(j):
+                    rows[i, j] -= low[j, k] * rows[i, k]
+                rows[i, j] /= low[j, j]
+                left[i] -= rows[i, j] ** 2
+            left[i] = max(left[i], 0.0)
+
+
+@_compile
+def bend(c, leds, inverse, chosen, height, pose, away):
+    """How far spikes are from moving in proportion with the pose, which goes away to both sides.
+
+    Returns the second-order part of what they do over the first-order part, of all in σ.
+    """
+    even = odd = 0.0
+    for i in range(len(leds)):
+        if chosen[i]:
+            here = expected(c, leds[i], pose, height)
+            ahead = expected(c, leds[i], pose + away, height)
+            behind = expected(c, leds[i], pose - away, height)
+            if not (ahead[5] > 0 and behind[5] > 0):
+                return math.inf
+            even += ((ahead[0] + behind[0] - 2 * here[0]) * inverse[i]) ** 2
+            odd += ((ahead[0] - behind[0]) * inverse[i]) ** 2
+    return math.sqrt(even / odd) if odd > 0 else math.inf
 
 
 @_compile
@@ -312,9 +372,10 @@ def over_heights(
 ):
     """Mean pose and covariance over all heights, each as likely as spikes and prior make it.
 
-    Heights are divided into cells, and those that matter again until there are enough. Returns the
-    least chi², the mean height, its standard deviation, and whether the pose is determined; sets
-    `likeliest` to the pose and height of the least chi².
+    Heights are divided into cells; those that matter, and all about a maximum that may come to
+    matter (there may be two, above and below the LEDs), again until they are fine enough. Returns
+    the least chi², the mean height, its standard deviation, and whether the pose is determined;
+    sets `likeliest` to the pose and height of the least chi².
     """
     first, last = _reach(c, leds, chosen, elevation, pose)
     if not math.isinf(spread):
@@ -351,13 +412,24 @@ def over_heights(
         best = likely[:cells].max()
         if math.isinf(best):
             return math.inf, prior, spread, False
-        count = 0.0
-        for k in range(cells):
-            count += math.exp(likely[k] - best)
-        if count >= 6:
+        order = np.argsort(at[:cells])
+        split = np.zeros(cells, dtype=np.bool_)
+        for n in range(cells):
+            k = order[n]
+            before, after = order[max(n - 1, 0)], order[min(n + 1, cells - 1)]
+            top = likely[k]
+            if math.isinf(top) or top < max(likely[before], likely[after]):
+                continue
+            # by no more than it falls off can it be higher within a cell
+            fall = 0.0
+            for side in (before, after):
+                fall = max(fall, top - likely[side] if not math.isinf(likely[side]) else LIKELY)
+            if fall > FINE and top + fall > best - LIKELY:
+                split[before] = split[k] = split[after] = True
+        if not split.any():
             break
-        for k in range(cells):  # a cell that matters becomes three
-            if likely[k] > best - LIKELY and solved + 2 <= CELLS:
+        for k in range(cells):
+            if (split[k] or likely[k] > best - LIKELY) and solved + 2 <= CELLS:
                 width[k] /= 3
                 at[solved], at[solved + 1] = at[k] - width[k], at[k] + width[k]
                 width[solved] = width[solved + 1] = width[k]
@@ -427,7 +499,7 @@ def consensus(c, leds, pixels, inverse, chosen, height, known, limit, tries, pos
             cost = 0.0
             for led in range(n):
                 if chosen[led]:
-                    u, _, _, _, z = expected(c, leds[led], there, height)
+                    u, _, _, _, _, z = expected(c, leds[led], there, height)
                     r = (pixels[led] - u) * inverse[led]
                     cost += min(r * r, limit * limit) if z > 0 else limit * limit
             if cost < best:

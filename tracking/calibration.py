@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import math
+import operator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Self, get_args
 
@@ -20,6 +21,7 @@ import numpy as np
 from acquisition.dat import replacing
 from raytransfer import _checks as check
 from raytransfer.designs import Design
+from raytransfer.sensors import TCD1304
 from tracking.camera import Camera
 from tracking.leds import LedMap
 from tracking.poses import UNKNOWN, Prior, closed_form, optical, pose_jacobian
@@ -184,6 +186,10 @@ class FourCorners:
         )
 
 
+BEYOND = 1000.0
+"""px: no spike lies so far beyond the ends of the line."""
+
+
 @dataclass(frozen=True)
 class Observation:
     """Spikes seen from one pose.
@@ -219,13 +225,22 @@ class Observation:
     height: float = 0.0
 
     def __post_init__(self) -> None:
-        channels = tuple(int(channel) for channel in self.channels)
+        channels = tuple(_whole("LED channel", channel) for channel in self.channels)
         pixels = check.array("pixels", self.pixels, "leave out LEDs that were not found")
-        sigma = np.broadcast_to(check.positive_array("sigma", self.sigma), pixels.shape)
+        sigma = check.positive_array("sigma", self.sigma, "leave out LEDs that were not found")
         if pixels.shape != (len(channels),):
             raise ValueError(
                 f"pixels has shape {pixels.shape}: one spike for each of {len(channels)} channels "
                 "is needed"
+            )
+        if sigma.shape not in {(), pixels.shape}:
+            raise ValueError(f"sigma is one number, or has shape {pixels.shape}, not {sigma.shape}")
+        sigma = np.broadcast_to(sigma, pixels.shape)
+        middle = (TCD1304.pixels - 1) / 2
+        if pixels.size and (far := np.abs(pixels - middle)).max() > middle + BEYOND:
+            raise ValueError(
+                f"pixels = {pixels[far.argmax()]:g}: allowed is the line, 0 to {2 * middle:.0f} px, "
+                f"or up to {BEYOND:.0f} px beyond; were samples or mm given?"
             )
         if len(set(channels)) != len(channels):
             raise ValueError(f"LED channels {list(channels)}: each is seen once from a pose")
@@ -236,6 +251,14 @@ class Observation:
                 raise ValueError(
                     f"σ of {name} = {spread}: allowed is 0 (known) to infinity (unknown)"
                 )
+        value, spread = self.heading
+        if abs(value) > 2 * math.pi:
+            raise ValueError(f"heading = {value:g} rad: allowed is -2π to 2π; were degrees given?")
+        if 2 * math.pi < spread < math.inf:
+            raise ValueError(
+                f"σ of heading = {spread:g} rad: allowed is up to 2π, or infinity (unknown); were "
+                "degrees given?"
+            )
         check.number("height", self.height, "mm")
         for name, value in (("channels", channels), ("pixels", pixels), ("sigma", sigma)):
             object.__setattr__(self, name, value)
@@ -284,6 +307,25 @@ class Calibration:
             )
         if self.covariance is None and self.names:
             raise ValueError("names of estimated parameters come with their covariance")
+        if len(set(self.names)) != len(self.names):
+            raise ValueError(f"names {list(self.names)}: each may be there once")
+        if self.covariance is not None:
+            _refuse_no_covariance(np.asarray(self.covariance))
+        if not math.isnan(self.rms):
+            check.not_negative("rms", self.rms, "px")
+        if _whole("spikes", self.spikes) < 0:
+            raise ValueError(f"spikes = {self.spikes}: allowed is >= 0")
+        _whole("redundancy", self.redundancy)
+        middle = (TCD1304.pixels - 1) / 2
+        if abs(self.camera.centre - middle) > 2 * TCD1304.pixels:
+            raise ValueError(
+                f"centre of the camera = {self.camera.centre:g} px: the line has {TCD1304.pixels}"
+            )
+        if abs(self.camera.pupil) > FARTHEST_PUPIL:
+            raise ValueError(
+                f"pupil of the camera = {self.camera.pupil:g} mm: allowed is within "
+                f"± {FARTHEST_PUPIL:g} mm of the first vertex"
+            )
         if unknown := set(self.names) - set(_names(self.camera, self.leds)):
             raise ValueError(f"names: neither camera nor LEDs have {', '.join(sorted(unknown))}")
 
@@ -440,6 +482,38 @@ class Calibration:
             file.write(f"{text}\n".encode())
 
 
+FARTHEST_PUPIL = 500.0
+"""mm; far more than a head is long."""
+
+
+def _whole(name: str, value: Any) -> int:
+    """Return a whole number as int; neither cut off what is none nor take a truth value."""
+    try:
+        if isinstance(value, bool | np.bool_):
+            raise TypeError
+        return operator.index(value)
+    except TypeError:
+        raise TypeError(f"{name} = {value!r}: a whole number is needed") from None
+
+
+def _refuse_no_covariance(covariance: NDArray[np.float64]) -> None:
+    """Refuse a square matrix that is no covariance: not symmetric, or with a negative variance."""
+    check.array("covariance", covariance)
+    variance = np.diag(covariance)
+    if variance.size and variance.min() < 0:
+        raise ValueError(f"covariance has a variance of {variance.min():g}: allowed is >= 0")
+    size = np.sqrt(variance)
+    scaled = covariance / np.where(size > 0, size, 1.0) / np.where(size > 0, size, 1.0)[:, None]
+    if scaled.size and np.abs(scaled - scaled.T).max() > ROUNDING:
+        raise ValueError("covariance is not symmetric")
+    if scaled.size and np.linalg.eigvalsh(scaled)[0] < -ROUNDING * len(scaled):
+        raise ValueError("covariance gives a sum of parameters a negative variance")
+
+
+ROUNDING = 1e-8
+"""Of a covariance whose variances are 1."""
+
+
 def load_calibration(path: str | os.PathLike[str]) -> Calibration:
     """Read a calibration file.
 
@@ -454,15 +528,41 @@ def load_calibration(path: str | os.PathLike[str]) -> Calibration:
     with open(path, "rb") as file:  # noqa: PTH123  # whatever names a file
         content = file.read()
     try:
-        return _calibration(json.loads(content.decode("utf-8")))
+        return _calibration(json.loads(content.decode("utf-8"), object_pairs_hook=_once))
     except (ValueError, TypeError, KeyError) as error:
         raise ValueError(f"{path}: {error}") from error
 
 
-_FIELDS = {
-    *("format", "version", "units", "notes", "camera", "leds", "correction"),
-    *("parameters", "covariance", "rms", "spikes", "redundancy"),
+_KINDS: Final[dict[str, tuple[type, ...]]] = {
+    "notes": (str,),
+    "camera": (dict,),
+    "leds": (list,),
+    "correction": (dict, type(None)),
+    "parameters": (list,),
+    "covariance": (list, type(None)),
+    "rms": (int, float, type(None)),
+    "spikes": (int,),
+    "redundancy": (int,),
 }
+_JSON: Final[dict[type, str]] = {
+    str: "a text",
+    dict: "a table",
+    list: "a list",
+    type(None): "null",
+    int: "a whole number",
+    float: "a number",
+}
+_FIELDS = {"format", "version", "units", *_KINDS}
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a table of JSON; one in which a name stands twice is refused."""
+    table = dict(pairs)
+    if len(table) != len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"{twice} is there twice")
+    return table
 
 
 def _calibration(data: Any) -> Calibration:
@@ -477,13 +577,28 @@ def _calibration(data: Any) -> Calibration:
     _refuse_other("", data, _FIELDS)
     if data["units"] != UNITS:
         raise ValueError(f"units = {data['units']}: this program reads {UNITS}")
-    for name, kinds in (("camera", (dict,)), ("leds", (list,)), ("notes", (str,))):
-        if not isinstance(data[name], kinds):
-            raise TypeError(f"{name} = {data[name]!r:.60}: a {kinds[0].__name__} is needed")
+    for name, kinds in _KINDS.items():
+        if not isinstance(data[name], kinds) or isinstance(data[name], bool):
+            names = " or ".join(_JSON[kind] for kind in kinds)
+            raise TypeError(f"{name} = {data[name]!r:.60}: {names} is needed")
     for number, led in enumerate(data["leds"], start=1):
-        _refuse_other(f"LED number {number}: ", led, {"channel", "position", "facing"})
-        if isinstance(led["channel"], bool) or not isinstance(led["channel"], int):
-            raise TypeError(f"LED number {number}: channel = {led['channel']!r}: a whole number")
+        where = f"LED number {number}: "
+        _refuse_other(where, led, {"channel", "position", "facing"})
+        place = led["position"]
+        if not isinstance(place, list) or len(place) != 3:
+            raise TypeError(
+                f"{where}position = {place!r:.60}: a list of x, y and z in mm is needed"
+            )
+        for value in (*place, led["facing"]):
+            check.number(f"{where}position and facing", value)
+    for name in data["parameters"]:
+        if not isinstance(name, str):
+            raise TypeError(f"parameters: {name!r:.60}: a name is needed")
+    rows = data["covariance"] or []
+    if any(not isinstance(row, list) or len(row) != len(rows) for row in rows):
+        raise TypeError("covariance: a square table is needed, as many lists of as many numbers")
+    if not data["leds"]:
+        raise ValueError("leds: none; a tracker needs one at least")
     leds = LedMap(
         *([led[key] for led in data["leds"]] for key in ("channel", "position", "facing"))
     )
@@ -495,8 +610,8 @@ def _calibration(data: Any) -> Calibration:
         tuple(data["parameters"]),
         None if covariance is None else check.array("covariance", covariance),
         math.nan if data["rms"] is None else check.not_negative("rms", data["rms"], "px"),
-        int(check.not_negative("spikes", data["spikes"])),
-        int(check.number("redundancy", data["redundancy"])),
+        data["spikes"],
+        data["redundancy"],
         data["notes"],
     )
 
@@ -589,21 +704,31 @@ def bundle(
         If the observations do not determine all that was left to them: it names what, and what to
         do. A straight rail of LEDs seen from unknown poses does not tell the scale.
     ValueError
-        If an LED is unknown, or a pose cannot be found to begin with.
+        If an LED is unknown, or a pose cannot be found to begin with; if what is given contradicts
+        itself: the line runs the other way, headings are clockwise, channels are swapped.
     RuntimeError
-        If no minimum is found.
+        If no minimum is found, or none at which the camera fits.
     """
     if loss not in get_args(Loss):
         raise ValueError(f"loss = {loss!r}: allowed are {', '.join(get_args(Loss))}")
     problem = _Bundle(observations, leds, _with_terms(camera, distortion, decentring))
     problem.know(led_sigma, camera_sigma or {})
     problem.refuse_gauge()
-    model_error = FIRST_ERROR
+    problem.refuse_contradiction()
+    model_error, failed = FIRST_ERROR, 0
     for _ in range(REWEIGHTINGS):
         problem.solve(loss, model_error)
         before, model_error = model_error, problem.left_over(model_error)
-        if abs(model_error - before) <= 0.02 * model_error:
+        if abs(model_error - before) <= max(0.02 * model_error, 0.1 * problem.noise.min()):
             break
+        failed = 0 if problem.converged else failed + 1
+        if failed == 2:  # it is lost, and would stay so for minutes
+            break
+    else:
+        problem.said.append(
+            f"The model's error had not settled after {REWEIGHTINGS} rounds: {before:.3g}, then "
+            f"{model_error:.3g} px; all σ are about as uncertain."
+        )
     return problem.result(loss, before, correction, notes)
 
 
@@ -681,6 +806,7 @@ class _Bundle:
                     f"observation {number} has LED {min(unknown)}: the map has {list(leds.channels)}"
                 )
         self.leds, self.camera, self.observations = leds, camera, observations
+        self.said: list[str] = []
         self.rows = _Rows(
             np.repeat(np.arange(len(observations)), [len(o.channels) for o in observations]),
             np.array([leds.index(c) for o in observations for c in o.channels], dtype=int),
@@ -771,6 +897,59 @@ class _Bundle:
             "for them), or say how well LEDs or poses are known",
             names,
         )
+
+    def refuse_contradiction(self) -> None:
+        """Refuse signs and orders that another one explains far better.
+
+        Over the tangents at which LEDs are from poses that are known about, spikes lie on a smooth
+        curve, whatever the lens; how far from it tells a mistake before the adjustment, which would
+        look for a camera that makes up for it.
+        """
+        told = np.array([all(math.isfinite(p.sigma) for p in (o.x, o.y, o.heading))
+                         for o in self.observations])[self.rows.pose]  # fmt: skip
+        if told.sum() < ENOUGH:
+            return
+        _, given, poses = self.state(self.values[self.free])
+        order = np.argsort(given[:, 0])
+        turned = np.empty_like(given)
+        turned[order] = given[order[::-1]]
+        cases = {
+            "as given": (given, poses),
+            "if headings were clockwise": (given, poses * [1, 1, -1, 1]),
+            "if x of the tracker ran the other way": (given, poses * [-1, 1, 1, 1]),
+            "if channels ran along the LEDs the other way": (turned, poses),
+        }
+        found = {case: self._curve(told, *of) for case, of in cases.items()}
+        off, scale = found["as given"]
+        best = min(found, key=lambda case: found[case][0])
+        if off > SUSPECT and found[best][0] < off / 5:
+            raise ValueError(
+                f"spikes are {off:.0f} px (median) from any smooth curve over the directions that "
+                f"poses and LEDs give, and {found[best][0]:.2g} px {best}"
+            )
+        if off < abs(scale) / 10 and scale * self.camera.scale < 0:
+            raise ValueError(
+                f"scale of the camera = {self.camera.scale:.0f} px, but poses, LEDs and spikes say "
+                f"about {scale:+.0f}: is the line read from its other end?"
+            )
+
+    def _curve(
+        self, told: NDArray[np.bool_], positions: NDArray[np.float64], poses: NDArray[np.float64]
+    ) -> tuple[float, float]:
+        """How far spikes are from a smooth curve over their tangents, and its slope at the axis, px."""
+        x, _, distance = self.rows.points(positions, poses)[told].T
+        if (distance <= 0).any():
+            return math.inf, 0.0
+        m = -x / distance
+        rows = np.stack([m, np.ones_like(m), m**2, m**3], axis=1)
+        weight = np.ones_like(m)
+        for _ in range(20):  # least sum of absolute values, which gross errors do not move
+            best = np.linalg.lstsq(rows * weight[:, None], self.pixels[told] * weight, rcond=None)[
+                0
+            ]
+            off = np.abs(self.pixels[told] - rows @ best)
+            weight = 1 / np.sqrt(np.maximum(off, 0.1))
+        return float(np.median(off)), float(best[0])
 
     def state(
         self, free: NDArray[np.float64]
@@ -892,8 +1071,8 @@ class _Bundle:
             if name in flat.tolist() or name in weak.tolist()
         ) + (("poses",) if loose_poses else ())
         keep = np.flatnonzero(adjusted)
-        camera, positions, _ = self.state(free)
-        said = [notes] if notes else []
+        camera, positions, poses = self.state(free)
+        said = [*([notes] if notes else []), *self.said]
         for name, s, before in zip(
             names[keep], sigma[keep], self.sigma[self.free][keep], strict=True
         ):
@@ -908,6 +1087,9 @@ class _Bundle:
             "it counts little."
             for i in far[:10]
         ]
+        if len(far) > 10:
+            said.append(f"So it is with {len(far) - 10} more, {len(far)} of {len(residuals)}.")
+        self._refuse_misfit(np.abs(residuals), spread, model_error)
         calibration = Calibration(
             replace(camera, model_error=model_error),
             LedMap(self.leds.channels, positions, self.leds.facings),
@@ -919,6 +1101,9 @@ class _Bundle:
             self.redundancy,
             "\n".join(said),
         )
+        implied = self._implied(calibration, poses)
+        if implied:
+            calibration = replace(calibration, notes="\n".join([*said, implied]))
         if undetermined:
             spreads = dict(zip(names.tolist(), sigma.tolist(), strict=True))
             values = ", ".join(
@@ -937,6 +1122,65 @@ class _Bundle:
             )
         return calibration
 
+    def _refuse_misfit(
+        self, off: NDArray[np.float64], spread: NDArray[np.float64], model_error: float
+    ) -> None:
+        """Refuse what no camera makes fit, and LEDs whose spikes are nearly all gross errors."""
+        if model_error > LOST:
+            raise RuntimeError(
+                f"no camera fits: spikes are {model_error:.0f} px from the best one; are signs and "
+                "units of poses and LEDs, and the LEDs' channels right?"
+            )
+        gross = off > OUTLIER * spread
+        wrong = []
+        for row, channel in enumerate(self.leds.channels):
+            own = self.rows.led == row
+            if own.sum() >= 3 and gross[own].mean() >= DISOWNED:
+                wrong.append(
+                    f"LED {channel}: {gross[own].sum()} of {own.sum()} spikes are off, by "
+                    f"{np.median(off[own]):.3g} px (median)"
+                )
+        if wrong:
+            raise ValueError(
+                f"{'; '.join(wrong)}. Were channels swapped, is the map wrong about them, or "
+                "led_sigma too small?"
+            )
+
+    def _implied(self, calibration: Calibration, poses: NDArray[np.float64]) -> str:
+        """Say what all that is not known does to poses such as those observed."""
+        said = []
+        for case, sigma_heading in (("known", 0.0), ("found", math.inf)):
+            spreads = []
+            for seen, pose in zip(self.observations, poses.tolist(), strict=True):
+                x, y, heading, height = pose
+                try:
+                    covariance = calibration.pose_covariance(
+                        seen.channels, x, y, heading, height=height, sigma_heading=sigma_heading
+                    )
+                except ValueError:  # too few LEDs for that
+                    continue
+                spreads.append(np.sqrt(np.diag(covariance)))
+            if spreads:
+                x, y = np.median(spreads, axis=0)[:2]
+                worst_x, worst_y = np.max(spreads, axis=0)[:2]
+                said.append(
+                    f"± {x:.2g} mm in x and ± {y:.2g} mm in y with a {case} heading (at worst "
+                    f"{worst_x:.2g} and {worst_y:.2g})"
+                )
+        return f"What is left open moves poses such as these by {'; '.join(said)}." if said else ""
+
+
+ENOUGH = 12
+"""Spikes from poses that are known about, for signs and orders to be judged by them."""
+
+SUSPECT = 20.0
+"""px: lenses are smoother, LEDs are known better and gross errors are rarer than that."""
+
+LOST = 100.0
+"""px: a camera that leaves more than this is none of the head."""
+
+DISOWNED = 0.8
+"""Part of an LED's spikes, of three or more, that may not be gross errors."""
 
 REDUNDANT = 0.1
 """Least part of a spike's error that must show in its residual for it to tell how large errors are."""
@@ -1012,6 +1256,6 @@ def _start(
     if not (optical(positions, x, y, heading)[:, 2] + camera.pupil > 0).all():
         raise ValueError(
             f"observation {number}: from x = {x:.0f}, y = {y:.0f} mm, heading {heading:.3g} rad an "
-            "LED is behind the tracker; are channels, signs and units right?"
+            "LED is behind the tracker; are channels, signs and units (rad, mm) right?"
         )
     return x, y, heading

@@ -101,8 +101,9 @@ class Camera:
         that bend along the line only, the sensor's place seen through them. It is of the design,
         not one of `parameters`: spikes hardly tell it.
     model_error : float
-        RMS of what the model leaves of exact light, px, over the field it was fitted to: another
-        independent error of each spike.
+        RMS of what the model leaves of exact light, px, over the field it was fitted to. Poses take
+        it for one more independent error of each spike, which it is from place to place; at one
+        place it is always the same, and no mean over frames makes it smaller.
     elevation : float
         Largest |Y| / (distance + depth) from which light reaches the line.
     """
@@ -131,9 +132,10 @@ class Camera:
         check.not_negative("model_error", self.model_error, "px")
         check.positive("elevation", self.elevation, "a tangent")
         for name, most in TERMS.items():
-            terms = tuple(
-                check.number(f"{name}[{i}]", v) for i, v in enumerate(getattr(self, name))
-            )
+            given = getattr(self, name)
+            if not isinstance(given, tuple | list):
+                raise TypeError(f"{name} = {given!r}: a list of numbers is needed, one per term")
+            terms = tuple(check.number(f"{name}[{i}]", v) for i, v in enumerate(given))
             if len(terms) > most:
                 raise ValueError(f"{name} has {len(terms)} terms: allowed are {most} at most")
             object.__setattr__(self, name, terms)
@@ -221,19 +223,32 @@ class Camera:
             px.
         q : array_like
             Of their points, as the module has it; 0 at the height of the axis.
+
+        Returns
+        -------
+        ndarray
+            NaN beyond the field, where the polynomials fold: no point lands there, or one could be
+            any of several.
         """
         u, height = np.broadcast_arrays(check.numbers("pixels", pixels), check.array("q", q))
         aim = (u - self.centre) / self.scale
         m = np.array(aim, dtype=float)
-        for _ in range(NEWTON_STEPS):
-            value, slope, _ = shape(self.coefficients, m, height)
-            m -= (value - aim) / slope
-        return m
+        with np.errstate(all="ignore"):  # from beyond the field it runs away
+            for _ in range(NEWTON_STEPS):
+                value, slope, _ = shape(self.coefficients, m, height)
+                m -= (value - aim) / slope
+            reached = np.abs(shape(self.coefficients, m, height)[0] - aim) < 1e-9
+            return np.where(reached & self._rises(m, height), m, math.nan)
+
+    def _rises(self, m: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether the spike moves on with m all the way from the axis: beyond a fold it does not."""
+        way = np.linspace(0.0, 1.0, 17).reshape(-1, *(1,) * np.ndim(m))
+        return np.asarray((shape(self.coefficients, way * m, q)[1] > 0).all(axis=0))
 
     def sees(
         self, points: ArrayLike, pixels: int = TCD1304.pixels, *, margin: float = 0.0
     ) -> NDArray[np.bool_]:
-        """Whether the spikes of points are on the line.
+        """Whether light of points reaches the line: their spikes are on it, and they not too high.
 
         Parameters
         ----------
@@ -245,7 +260,10 @@ class Camera:
             px at either end that do not count: light that is cut off there shifts its spike.
         """
         at = self.project(points)
-        return np.asarray((at >= margin) & (at <= pixels - 1 - margin))
+        x, y, distance = self._in_front(points)
+        m, rise = -x / (distance + self.pupil), np.abs(y) / (distance + self.depth)
+        seen = (at >= margin) & (at <= pixels - 1 - margin) & (rise <= self.elevation)
+        return np.asarray(seen & self._rises(m, rise**2 / (1 + m * m)))
 
     @classmethod
     def pinhole(cls, focal_length: float, pitch: float = TCD1304.pitch) -> Self:
@@ -288,7 +306,8 @@ class Camera:
         Returns
         -------
         Camera
-            With the RMS of what it leaves as `model_error`.
+            With the RMS of what it leaves as `model_error`, less what σ (if it is given) says that
+            noise leaves, and corrected for what a fit with so many terms can follow.
 
         Raises
         ------
@@ -351,7 +370,11 @@ class Camera:
                 f"the points do not tell all of {', '.join(counts)} asked for: coupling needs "
                 "heights, distortion the whole field"
             )
-        best = np.linalg.lstsq(rows, u / spread, rcond=None)[0]
+        if lengths.size:
+            rows = np.hstack([rows, found.jac])
+        # part of each spike's error that is left
+        left_part = 1 - (np.linalg.qr(rows)[0] ** 2).sum(axis=1)
+        best = np.linalg.lstsq(rows[:, : len(size)], u / spread, rcond=None)[0]
         scale, centre, *rates = best.tolist()
         free = iter(lengths.tolist())
         terms: dict[str, Any] = {}
@@ -366,11 +389,14 @@ class Camera:
             depth=next(free) if depth is None else depth,
         )
         left = u - camera.project(at)
+        noise = 0.0 if sigma is None else float((spread**2 * left_part).sum())
+        excess = max(float((left**2).sum()) - noise, 0.0)
+        spare = float(left_part.sum())
         highest = float(np.max(np.abs(at[:, 1] / (at[:, 2] + camera.depth))))
         return replace(
             camera,
-            model_error=float(np.sqrt(np.mean(left**2))),
-            elevation=elevation or highest or camera.elevation,
+            model_error=math.sqrt(excess / spare) if spare > 1e-6 else 0.0,
+            elevation=(highest or camera.elevation) if elevation is None else elevation,
         )
 
     @classmethod
@@ -485,9 +511,13 @@ class Camera:
 
         Raises
         ------
+        TypeError
+            If it is no dictionary, or a value is no number (or list of them, for terms).
         ValueError
-            If a name is unknown or missing, or a number is none.
+            If a name is unknown or missing, or a number is out of range.
         """
+        if not isinstance(data, dict):
+            raise TypeError(f"camera: names and numbers are needed, not {data!r:.60}")
         known = set(cls.__dataclass_fields__)
         if wrong := set(data) ^ known:
             raise ValueError(

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from numbers import Integral
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
 from acquisition.frames import CHANNELS
+from raytransfer import _checks as check
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -30,8 +33,11 @@ class LedMap:
 
     Raises
     ------
+    TypeError
+        If a channel is no whole number.
     ValueError
-        If shapes do not fit, a channel is out of range or used twice, or a number is not finite.
+        If shapes do not fit, a channel is out of range or used twice, a number is not finite, all
+        LEDs are within 20 mm (metres were given), or a direction is beyond ±2π (degrees were).
     """
 
     channels: tuple[int, ...]
@@ -41,8 +47,11 @@ class LedMap:
     def __init__(
         self, channels: Sequence[int], positions: ArrayLike, facings: ArrayLike | None = None
     ) -> None:
+        given: list[object] = list(channels)
+        if wrong := [n for n in given if isinstance(n, bool) or not isinstance(n, Integral)]:
+            raise TypeError(f"LED channel {wrong[0]!r}: a whole number is needed")
         numbers = tuple(int(channel) for channel in channels)
-        points = np.array(positions, dtype=float)
+        points = check.array("positions", positions).copy()
         if points.ndim != 2 or points.shape[1] not in (2, 3) or len(points) != len(numbers):
             raise ValueError(
                 f"positions has shape (N, 3) with one row for each of {len(numbers)} channels, "
@@ -50,13 +59,10 @@ class LedMap:
             )
         if points.shape[1] == 2:
             points = np.column_stack([points, np.zeros(len(points))])
-        turned = np.zeros(len(numbers)) if facings is None else np.array(facings, dtype=float)
-        if turned.shape != (len(numbers),):
-            raise ValueError(f"facings has shape ({len(numbers)},), not {turned.shape}")
-        if not (np.isfinite(points).all() and np.isfinite(turned).all()):
-            raise ValueError("positions and facings: all must be finite")
-        if wrong := [n for n in numbers if not 0 <= n < CHANNELS]:
-            raise ValueError(f"LED channel {wrong[0]}: allowed are 0 to {CHANNELS - 1}")
+        turned = check_facings(0.0 if facings is None else facings, len(numbers))
+        check_extent(points)
+        if outside := [n for n in numbers if not 0 <= n < CHANNELS]:
+            raise ValueError(f"LED channel {outside[0]}: allowed are 0 to {CHANNELS - 1}")
         if len(set(numbers)) != len(numbers):
             raise ValueError(f"LED channels {list(numbers)}: each may be used once")
         points.flags.writeable = turned.flags.writeable = False
@@ -101,9 +107,33 @@ class LedMap:
 
         Channels rise with x.
         """
-        if count < 1:
-            raise ValueError(f"count = {count}: allowed is >= 1")
-        number = np.arange(count)
-        x = (number - (count - 1) / 2) * pitch
-        y = np.where(number % 2, stagger, 0.0)
+        number = np.arange(check.whole("count", count))
+        x = (number - (count - 1) / 2) * check.number("pitch", pitch, "mm")
+        y = np.where(number % 2, check.number("stagger", stagger, "mm"), 0.0)
         return cls([first_channel + int(n) for n in number], np.column_stack([x, y]))
+
+
+LEAST_EXTENT = 20.0
+"""mm; LEDs nearer together than this tell no pose, and rooms in metres are smaller."""
+
+
+def check_extent(positions: NDArray[np.float64]) -> None:
+    """Refuse LEDs that are all in one place, or in metres."""
+    extent = float(np.ptp(positions, axis=0).max()) if len(positions) > 1 else math.inf
+    if extent < LEAST_EXTENT:
+        raise ValueError(
+            f"LEDs are {extent:g} mm apart at most: allowed is {LEAST_EXTENT:g} or more; "
+            "were their positions given in metres?"
+        )
+
+
+def check_facings(facings: ArrayLike, count: int) -> NDArray[np.float64]:
+    """Return a direction for each LED, rad; one may stand for all."""
+    given = check.array("facings", facings)
+    if given.shape not in {(), (count,)}:
+        raise ValueError(f"facings has shape ({count},), one per LED, not {given.shape}")
+    if (far := np.abs(given)[np.abs(given) > math.tau]).size:
+        raise ValueError(
+            f"facings: {far.flat[0]:g} rad: allowed are −2π to 2π; was it given in degrees?"
+        )
+    return np.broadcast_to(given, count).copy()

@@ -8,15 +8,17 @@ LEDs and tracker lie on one circle, from all points of which the LEDs appear und
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntFlag
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from raytransfer import _checks as check
 from raytransfer.localisation import pose_bound
+from raytransfer.sensors import TCD1304
+from tracking.leds import check_extent, check_facings
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -42,11 +44,15 @@ class PoseFlags(IntFlag):
     AMBIGUOUS = 16
     """Another pose explains the measurements as well."""
     DANGER_CIRCLE = 32
-    """LEDs and tracker lie near one circle: position and heading cannot be told apart."""
+    """LEDs and tracker lie near one circle: position and heading can hardly be told apart. Within
+    their errors spikes are not linear in them, and the covariance is not what poses scatter by."""
     INCONSISTENT = 64
     """Residuals are larger than the errors stated: something is wrong with the calibration."""
     HEADING_ASSUMED = 128
     """Heading was not measured but given."""
+    UNCHECKED = 512
+    """The others do not check every spike: a gross error of one could have moved the pose by more
+    than `HIDDEN` σ and not have been found."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +68,8 @@ class Estimate:
     heading : float
         rad.
     covariance : ndarray, shape (3, 3)
-        Of x, y and heading.
+        Of x, y and heading. What the camera's model leaves is in it (`Camera.model_error`), but is
+        the same in all estimates of one place.
     flags : PoseFlags
     """
 
@@ -184,8 +191,7 @@ def closed_form(
     P = C x + S y, Q = S x − C y. P and Q are eliminated, (C, S) is a singular vector; that LEDs are
     in front decides the sign. Without noise the pose is exact but for rounding, which grows as the
     LEDs and the tracker come to lie on one circle: the error is about 1e-13 mm over the share of the
-    heading's information that position does not explain away (`locate` flags less than 1e-4 of it as
-    DANGER_CIRCLE). With noise, equations are weighted by distance and solved a second time.
+    heading's information that position does not explain away. With noise, equations are weighted by distance and solved a second time.
 
     Parameters
     ----------
@@ -258,7 +264,7 @@ def two_leds(
     ValueError
         If the spikes fit no position before the LEDs.
     """
-    places, spikes = _positions(leds), _spikes(pixels, 2)
+    places, spikes = _positions(leds), _spikes(check.array("pixels", pixels), 2)
     if len(places) != 2:
         raise ValueError(f"leds has shape (2, 3), not {places.shape}; for more there is locate")
     turned = _angle("heading", heading)
@@ -275,6 +281,7 @@ def locate(
     heading: Prior = UNKNOWN,
     height: Prior = KNOWN,
     start: tuple[float, float, float] | None = None,
+    facings: ArrayLike | None = None,
 ) -> Fix:
     """Pose from the spikes of LEDs at known places: weighted least squares, without gross errors.
 
@@ -282,8 +289,11 @@ def locate(
     over: mean and covariance are those of poses at all heights from which light can arrive, each as
     likely as its prior and the spikes make it.
 
-    A fit that is less likely than 1 in 10⁴ is repeated without the spikes that disagree with the
-    others, if these are less than a third: more is no gross error but a wrong map, camera or height.
+    A fit that is less likely than 1 in 10⁴, or has a spike 4 σ off what the others say, is repeated
+    without the spikes that disagree with the others, if these are less than a third: more is no
+    gross error but a wrong map, camera or height. What the others do not say cannot be checked: of
+    three spikes, or two with known heading, nothing, and of four or five not enough to be sure
+    (`PoseFlags.UNCHECKED`).
 
     Parameters
     ----------
@@ -292,12 +302,16 @@ def locate(
     positions : array_like, shape (N, 3)
         Room x, y and z of the LEDs, mm.
     pixels, sigma : array_like, shape (N,)
-        Their spikes and standard deviations, px. Spikes that are NaN or have infinite σ are left
-        out as if they were not there.
+        Their spikes and standard deviations, px; one σ may stand for all. Spikes that are NaN or
+        have infinite σ are left out as if they were not there.
     heading, height : Prior
         Height in mm, heading in rad.
     start : tuple of float, optional
         x, y and heading to begin with; from the closed form when left out.
+    facings : array_like, shape (N,), optional
+        Directions in which the LEDs shine, rad, counter-clockwise from +y; one may stand for all.
+        No pose is looked for where they shine away from it. When left out they may be seen from
+        anywhere: then a line of LEDs in reversed order, heading unknown, has a pose behind it.
 
     Returns
     -------
@@ -308,34 +322,66 @@ def locate(
     Raises
     ------
     ValueError
-        If there are fewer than two spikes, shapes do not match, a number is out of range, or no
-        pose has the LEDs in front.
+        If there are fewer than two spikes, shapes do not match, a number is out of range, a spike
+        is more than the line's length off the line, all LEDs are within 20 mm, or no pose has the
+        LEDs in front, and itself on their lit side.
     """
-    leds = _positions(positions).copy()  # kernels are compiled for arrays that can be written
+    leds = _positions(positions)
     u = check.numbers("pixels", pixels)
-    spread = np.broadcast_to(check.numbers("sigma", sigma), u.shape)
+    given = check.numbers("sigma", sigma)
     if u.shape != (len(leds),):
         raise ValueError(f"pixels has shape ({len(leds)},), one per LED, not {u.shape}")
-    if (spread <= 0).any():
-        raise ValueError(f"sigma = {spread[spread <= 0][0]:g} px: allowed is > 0")
-    seen = np.isfinite(u) & np.isfinite(spread)
+    if given.shape not in {(), u.shape}:
+        raise ValueError(f"sigma is one number or has shape {u.shape}, not {given.shape}")
+    spread = np.broadcast_to(given, u.shape)
+    found = np.isfinite(u)
+    if (wrong := spread[found & ~(spread > 0)]).size:
+        raise ValueError(
+            f"sigma = {wrong[0]:g} px: allowed is > 0, infinite for a spike to be left out"
+        )
+    seen = found & np.isfinite(spread)
     if seen.sum() < 2:
         raise ValueError(
             f"{seen.sum()} spikes: a pose needs 2 with known heading, 3 without; "
             "a single one is for the motion filter"
         )
+    _spikes(u[seen], int(seen.sum()))
+    check_extent(leds[seen])
     heading, height = _prior("heading", heading), _prior("height", height)
     _angle("heading.value", heading.value)
-    inverse = np.zeros(len(u))
-    inverse[seen] = 1 / np.hypot(spread[seen], camera.model_error)
-    problem = _Problem(camera, leds, np.where(seen, u, 0.0), inverse, heading, height)
-    answer = problem.solve(seen, start)
+    if math.pi < heading.sigma < math.inf:
+        raise ValueError(
+            f"heading.sigma = {heading.sigma:g} rad: allowed are 0 to π, and infinity if nothing is "
+            "known; was it given in degrees?"
+        )
+    if start is not None:
+        if len(start) != 3:
+            raise ValueError(f"start is x, y and heading, not {len(start)} numbers")
+        x, y, turned = start
+        start = check.number("start[0]", x), check.number("start[1]", y), _angle("start[2]", turned)
+    normals = np.zeros((len(leds), 2))
+    if facings is not None:
+        shines = check_facings(facings, len(leds))
+        normals = np.column_stack([-np.sin(shines), np.cos(shines)])
+    problem = _Problem(
+        camera,
+        np.hstack([leds, normals])[seen],
+        u[seen],
+        1 / np.hypot(spread[seen], camera.model_error),
+        heading,
+        height,
+    )
+    every = np.ones(int(seen.sum()), dtype=np.bool_)
+    answer = problem.solve(every, start)
     if start is not None and not answer.chi2 <= _limit(answer.degrees, REFUSED):
-        answer = min(answer, problem.solve(seen), key=lambda a: a.chi2)
+        answer = min(answer, problem.solve(every), key=lambda a: a.chi2)
     flags = PoseFlags.NONE
-    if not answer.chi2 <= _limit(answer.degrees, REFUSED):
-        answer, flags = problem.without_gross_errors(answer, seen)
-    return problem.fix(answer, seen, flags)
+    if problem.suspect(answer):
+        answer, flags = problem.without_gross_errors(answer)
+    fix = problem.fix(answer, flags)
+    residuals, rejected = np.full(len(u), math.nan), np.zeros(len(u), dtype=np.bool_)
+    residuals[seen], rejected[seen] = fix.residuals, fix.rejected
+    return replace(fix, residuals=residuals, rejected=rejected)
 
 
 REFUSED = 1e-4
@@ -356,8 +402,18 @@ AGREES = 4.0
 TRIES = 400
 """Minimal sets of LEDs that are tried, at most."""
 
-ON_CIRCLE = 1e-4
-"""Part of the heading's information that is left where LEDs and tracker are said to lie on a circle."""
+HIDDEN = 6.0
+"""How far, in σ of the pose, a gross error may move it before it is found, or the pose is flagged."""
+
+ROUNDING = 1e-9
+"""Part of an error that is left in a residual, below which it is none."""
+
+BENT = 0.5
+"""Second-order over first-order part of what spikes do within 2 σ of the pose, above which LEDs and
+tracker are said to lie on a circle."""
+
+OUT_OF_REACH = 1e4
+"""mm; an unknown height is no farther off."""
 
 
 class _Answer(NamedTuple):
@@ -370,14 +426,16 @@ class _Answer(NamedTuple):
     determined: bool
     chosen: NDArray[np.bool_]
     likeliest: NDArray[np.float64]  # pose and height of the least χ²
+    residuals: NDArray[np.float64]  # there, px, of spikes that were not chosen too
+    left: NDArray[np.float64]  # part of each error that its residual shows
 
 
 @dataclass(frozen=True)
 class _Problem:
-    """Spikes and all that is known; arrays as the kernels want them."""
+    """Spikes that were seen and all that is known; arrays as the kernels want them."""
 
     camera: Camera
-    leds: NDArray[np.float64]
+    leds: NDArray[np.float64]  # x, y, z, and the normal of the lit side
     pixels: NDArray[np.float64]
     inverse: NDArray[np.float64]
     heading: Prior
@@ -414,7 +472,7 @@ class _Problem:
         degrees -= math.isinf(self.height.sigma)
         first = None
         if start is not None:
-            first = np.array([*(check.number("start", v) for v in start)])
+            first = np.array(start)
             if known:
                 first[2] = self.heading.value
         else:
@@ -424,14 +482,15 @@ class _Problem:
             if first is None and not known:
                 first = self.begin(chosen, self.height.value, known=not trusted)
         covariance = np.zeros((3, 3))
-        nowhere = np.full(4, math.nan)
+        nowhere, none = np.full(4, math.nan), np.full(len(chosen), math.nan)
         failed = _Answer(
-            nowhere[:3], covariance, math.inf, degrees, math.nan, 0.0, False, chosen, nowhere
+            *(nowhere[:3], covariance, math.inf, degrees, math.nan, 0.0, False),
+            *(chosen, nowhere, none, none),
         )
         if first is None:
             return failed
         kernels = load_kernels()
-        sharpness = math.inf if known else 1 / self.heading.sigma**2
+        sharpness = math.inf if known else _sharpness(self.heading.sigma)
         at = (self.camera.coefficients, self.leds, self.pixels, self.inverse, chosen)
         turn = (self.heading.value, sharpness)
         if self.height.sigma == 0:
@@ -446,21 +505,49 @@ class _Problem:
         if math.isinf(chi2):
             return failed
         return _Answer(
-            first, covariance, chi2, degrees, high, high_sigma, determined, chosen, likeliest
+            *(first, covariance, chi2, degrees, high, high_sigma, determined),
+            *(chosen, likeliest, *self.judge(likeliest, chosen)),
         )
 
-    def without_gross_errors(
-        self, full: _Answer, seen: NDArray[np.bool_]
-    ) -> tuple[_Answer, PoseFlags]:
+    def judge(
+        self, at: NDArray[np.float64], chosen: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Residuals at x, y, heading and height, px, and the part of errors that is left in them."""
+        residuals, left = np.empty((2, len(self.pixels)))
+        known = self._known(int(chosen.sum()))
+        load_kernels().judge(
+            self.camera.coefficients,
+            self.leds,
+            self.pixels,
+            self.inverse,
+            chosen,
+            float(at[3]),
+            _sharpness(min(self.height.sigma, OUT_OF_REACH)),
+            math.inf if known else _sharpness(self.heading.sigma),
+            at[:3],
+            residuals,
+            left,
+        )
+        return residuals, left
+
+    def suspect(self, answer: _Answer) -> bool:
+        """Whether the spikes disagree, all of them or one with what the others say."""
+        if not answer.chi2 <= _limit(answer.degrees, REFUSED):
+            return True
+        checked = answer.left > ROUNDING
+        off = np.abs(answer.residuals) * self.inverse
+        return bool((off[checked] > AGREES * np.sqrt(answer.left[checked])).any())
+
+    def without_gross_errors(self, full: _Answer) -> tuple[_Answer, PoseFlags]:
         """Fit most spikes, leaving out those that disagree."""
-        count = int(seen.sum())
-        fewest = 3 + (count >= 3 and math.isinf(self.heading.sigma))  # one more than is needed
+        count = len(self.pixels)
+        fewest = 3 + (count >= 3 and not self._told(full))  # one more than is needed
         if count <= fewest:
             # whichever is left out, the others agree
             several = PoseFlags.AMBIGUOUS if count == fewest else PoseFlags.NONE
             return full, several
-        candidates = [self._without(seen, np.arange(len(seen)) == i) for i in np.flatnonzero(seen)]
-        if (agreed := self._consensus(seen)) is not None:
+        candidates = [self.solve(np.arange(count) != i) for i in range(count)]
+        if (agreed := self._consensus()) is not None:
             candidates.append(agreed)
         good = [
             c
@@ -484,11 +571,17 @@ class _Problem:
             flags |= PoseFlags.AMBIGUOUS
         return best, flags
 
-    def _without(self, seen: NDArray[np.bool_], gone: NDArray[np.bool_]) -> _Answer:
-        return self.solve(seen & ~gone)
+    def _told(self, answer: _Answer) -> bool:
+        """Whether the heading is known beforehand at least as well as the spikes tell it."""
+        if self.heading.sigma == 0 or math.isinf(self.heading.sigma):
+            return self.heading.sigma == 0
+        if math.isinf(answer.chi2) or not answer.determined:
+            return True
+        return bool(answer.covariance[2, 2] > 0.5 * self.heading.sigma**2)
 
-    def _consensus(self, seen: NDArray[np.bool_]) -> _Answer | None:
+    def _consensus(self) -> _Answer | None:
         """Fit the spikes that agree with the best minimal set."""
+        every = np.ones(len(self.pixels), dtype=np.bool_)
         best, found = math.inf, None
         for high in self._heights():
             pose = np.array([0.0, 0.0, self.heading.value])
@@ -497,7 +590,7 @@ class _Problem:
                 self.leds,
                 self.pixels,
                 self.inverse,
-                seen,
+                every,
                 high,
                 self.heading.sigma == 0,
                 AGREES,
@@ -508,7 +601,7 @@ class _Problem:
                 best, found = cost, np.append(pose, high)
         if found is None:
             return None
-        chosen = seen & (np.abs(self.residuals(found)) * self.inverse < AGREES)
+        chosen = np.abs(self.judge(found, every)[0]) * self.inverse < AGREES
         answer = None
         for _ in range(5):
             if chosen.sum() < 3:
@@ -516,7 +609,7 @@ class _Problem:
             answer = self.solve(chosen)
             if math.isinf(answer.chi2):
                 return None
-            again = seen & (np.abs(self.residuals(answer.likeliest)) * self.inverse < AGREES)
+            again = np.abs(answer.residuals) * self.inverse < AGREES
             if (again == chosen).all():
                 break
             chosen = again
@@ -532,19 +625,14 @@ class _Problem:
             spread = self.camera.elevation * max(apart, 1000.0)
         return [self.height.value + k * spread for k in (-1.5, -0.7, 0.0, 0.7, 1.5)]
 
-    def residuals(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Measured minus expected at x, y, heading and height, px."""
-        x, y, heading, height = at.tolist()
-        points = optical(self.leds, x, y, heading, height)
-        return np.asarray(self.pixels - self.camera.project(points))
-
-    def fix(self, answer: _Answer, seen: NDArray[np.bool_], flags: PoseFlags) -> Fix:
+    def fix(self, answer: _Answer, flags: PoseFlags) -> Fix:
         """Return the result with all its warnings."""
         if math.isinf(answer.chi2):
+            lit = " and itself on their lit side" if self.leds[:, 3:].any() else ""
             raise ValueError(
-                f"spikes at {self.pixels[seen].round(2).tolist()} px fit no pose with their LEDs "
-                "in front: are LEDs and spikes in the same order, positions in mm and the heading "
-                f"({self.heading.value:g}) in rad?"
+                f"spikes at {self.pixels.round(2).tolist()} px fit no pose with their LEDs "
+                f"in front{lit}: are LEDs and spikes in the same order, positions in mm and the "
+                f"heading ({self.heading.value:g}) in rad?"
             )
         chosen = answer.chosen
         count = int(chosen.sum())
@@ -556,43 +644,51 @@ class _Problem:
             covariance = np.full((3, 3), math.inf)
         elif not answer.determined:
             covariance = self._bound(answer)
-        elif self.heading.sigma > 0 and count >= 3:
-            share = load_kernels().heading_seen(
-                self.camera.coefficients,
-                self.leds,
-                self.inverse,
-                chosen,
-                answer.height,
-                answer.pose,
-            )
-            if share < ON_CIRCLE:
-                flags |= PoseFlags.DANGER_CIRCLE
-        if not answer.determined and count >= 3:
+        if count >= 3 and (not answer.determined or self._bent(answer)):
             flags |= PoseFlags.DANGER_CIRCLE
+        # an error of which AGREES σ are left in the residual moves the pose by this much
+        left = answer.left[chosen]
+        if (AGREES**2 * (1 - left) > HIDDEN**2 * left).any():
+            flags |= PoseFlags.UNCHECKED
         if not answer.chi2 <= _limit(answer.degrees, INCONSISTENT):
             flags |= PoseFlags.INCONSISTENT
         x, y, turned = answer.pose.tolist()
-        residuals = self.residuals(answer.likeliest)
-        residuals[~seen] = math.nan
         return Fix(
             x,
             y,
             math.remainder(turned, math.tau),
             answer.height,
             covariance,
-            residuals,
-            seen & ~chosen,
+            answer.residuals,
+            ~chosen,
             answer.chi2,
             answer.degrees,
             flags,
             answer.sigma_height,
         )
 
+    def _bent(self, answer: _Answer) -> bool:
+        """Whether spikes are far from linear in the pose, where it is least known."""
+        if self.heading.sigma == 0:
+            return False
+        away = 2 * answer.covariance[2] / math.sqrt(answer.covariance[2, 2])
+        away *= min(1.0, TRUSTED / away[2])  # farther is round the circle
+        bend = load_kernels().bend(
+            self.camera.coefficients,
+            self.leds,
+            self.inverse,
+            answer.chosen,
+            answer.height,
+            answer.pose,
+            away,
+        )
+        return bool(bend > BENT)
+
     def _bound(self, answer: _Answer) -> NDArray[np.float64]:
         """Covariance with infinities where nothing is known."""
         chosen = answer.chosen
         x, y, heading, height = answer.likeliest.tolist()
-        rows = pose_jacobian(self.camera, self.leds[chosen], x, y, heading, height)
+        rows = pose_jacobian(self.camera, self.leds[chosen, :3], x, y, heading, height)
         found = pose_bound(rows, 1 / self.inverse[chosen], sigma_heading=self.heading.sigma)
         return found.covariance
 
@@ -620,13 +716,18 @@ def pose_jacobian(
     by_x, _, by_distance = np.moveaxis(camera.jacobian(points), -1, 0)
     turned = np.asarray(heading, dtype=float)[..., None]
     sin, cos = np.sin(turned), np.cos(turned)
-    return np.stack(
-        [
-            by_x * cos - by_distance * sin,
-            by_x * sin + by_distance * cos,
-            by_x * points[..., 2] - by_distance * points[..., 0],
-        ],
-        axis=-1,
+    return np.stack(by_pose(by_x, by_distance, points[..., 0], points[..., 2], cos, sin), axis=-1)
+
+
+def by_pose(by_x: Any, by_distance: Any, across: Any, distance: Any, cos: Any, sin: Any) -> Any:
+    """Derivatives along x, y and heading from those along optical X and distance.
+
+    Plain arithmetic: of arrays in numpy, of numbers where it is compiled.
+    """
+    return (
+        by_x * cos - by_distance * sin,
+        by_x * sin + by_distance * cos,
+        by_x * distance - by_distance * across,
     )
 
 
@@ -675,34 +776,10 @@ def dilution(
         Arrays of the broadcast shape of the pose.
     """
     check.positive("sigma", sigma, "px")
-    if not sigma_heading >= 0:
-        raise ValueError(
-            f"sigma_heading = {sigma_heading}: allowed is 0 (known) to infinity (unknown)"
-        )
-    rows = pose_jacobian(camera, positions, x, y, heading, height) / sigma
     seen = camera.sees(optical(positions, x, y, heading, height))
-    rows = np.where(seen[..., None], rows, 0.0)
-    size = 3 if sigma_heading else 2
-    information = np.swapaxes(rows, -1, -2)[..., :size, :] @ rows[..., :size]
-    if sigma_heading:
-        information[..., 2, 2] += 1 / sigma_heading**2
-    scale = np.sqrt(np.einsum("...ii->...i", information))
-    scale = np.where(scale > 0, scale, 1.0)
-    # as correlations: rounding leaves about 1e-15 of what is not determined
-    values, vectors = np.linalg.eigh(information / scale[..., :, None] / scale[..., None, :])
-    with np.errstate(divide="ignore"):
-        inverse = np.where(values > 1e-13, 1 / np.maximum(values, 1e-300), math.inf)
-    share = vectors**2
-    with np.errstate(invalid="ignore"):
-        variance = np.where(
-            (share > 1e-18) | np.isfinite(inverse[..., None, :]),
-            share * inverse[..., None, :],
-            0.0,
-        ).sum(axis=-1)
-    spread = np.sqrt(variance) / scale
-    if not sigma_heading:
-        spread = np.concatenate([spread, np.zeros((*spread.shape[:-1], 1))], axis=-1)
-    return Dilution(*np.moveaxis(spread, -1, 0))
+    rows = pose_jacobian(camera, positions, x, y, heading, height)
+    bound = pose_bound(np.where(seen[..., None], rows, 0.0), sigma, sigma_heading=sigma_heading)
+    return Dilution(*np.sqrt(np.moveaxis(np.diagonal(bound.covariance, axis1=-2, axis2=-1), -1, 0)))
 
 
 def load_kernels() -> ModuleType:
@@ -735,10 +812,15 @@ def _positions(positions: ArrayLike) -> NDArray[np.float64]:
     return np.ascontiguousarray(points)
 
 
-def _spikes(pixels: ArrayLike, count: int) -> NDArray[np.float64]:
-    spikes = check.array("pixels", pixels)
+def _spikes(spikes: NDArray[np.float64], count: int) -> NDArray[np.float64]:
     if spikes.shape != (count,):
         raise ValueError(f"pixels has shape ({count},), one per LED, not {spikes.shape}")
+    length = TCD1304.pixels
+    if (far := spikes[np.abs(spikes - length / 2) > 1.5 * length]).size:
+        raise ValueError(
+            f"pixels: a spike at {far[0]:g} px: the line has {length}, and one may be {length} off "
+            "its ends at most"
+        )
     return spikes
 
 
@@ -754,6 +836,11 @@ def _angle(name: str, value: float) -> float:
     if abs(angle) > math.tau:
         raise ValueError(f"{name} = {angle:g} rad: allowed are −2π to 2π; was it given in degrees?")
     return angle
+
+
+def _sharpness(sigma: float) -> float:
+    """1/σ², infinite if σ is 0."""
+    return 1 / sigma**2 if sigma else math.inf
 
 
 def _enough(count: int, known: bool) -> None:

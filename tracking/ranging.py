@@ -21,6 +21,7 @@ from raytransfer import _checks as check
 from raytransfer.irradiance import pixel_response
 from raytransfer.sensors import TCD1304
 from raytransfer.tolerances import Tolerances, perturb
+from tracking.camera import PEAK
 from tracking.poses import KNOWN, UNKNOWN, Prior
 from tracking.spikes import Spike, SpikeFinder, SpikeFlags
 
@@ -523,9 +524,6 @@ def _disc(diameter: float) -> NDArray[np.float64]:
     edges = np.clip((np.arange(2 * reach + 2) - reach - 0.5) / (diameter / 2), -1, 1)
     return np.asarray(np.diff(edges * np.sqrt(1 - edges**2) + np.arcsin(edges)) / math.pi)
 
-
-PEAK = 24_500.0
-"""Electrons of the brightest pixel for which widths are computed: 0.7 of a full well."""
 
 RAYS = (192, 48)
 """Over the opening, for widths."""

@@ -19,7 +19,17 @@ import numpy as np
 
 from raytransfer import _checks as check
 from tracking.camera import image
-from tracking.poses import AGREES, INCONSISTENT, PLAUSIBLE, REFUSED, PoseFlags
+from tracking.poses import (
+    AGREES,
+    HIDDEN,
+    INCONSISTENT,
+    PLAUSIBLE,
+    REFUSED,
+    ROUNDING,
+    PoseFlags,
+    _angle,
+    _limit,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -48,7 +58,7 @@ class MountedCamera:
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        check.number("roll of the mount", self.roll, "rad")
+        _angle("roll of the mount", self.roll)
         if len(self.offset) != 3:
             raise ValueError(f"offset = {self.offset}: right, up and backward in mm are needed")
         for value in self.offset:
@@ -70,7 +80,7 @@ class SpacePose:
     x, y, z : float
         mm.
     heading, pitch, roll : float
-        rad; see `rotation`.
+        rad, −2π to 2π; see `rotation`.
     """
 
     x: float
@@ -79,6 +89,12 @@ class SpacePose:
     heading: float = 0.0
     pitch: float = 0.0
     roll: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("x", "y", "z"):
+            check.number(name, getattr(self, name), "mm")
+        for name in ("heading", "pitch", "roll"):
+            _angle(name, getattr(self, name))
 
 
 @dataclass(frozen=True)
@@ -89,8 +105,8 @@ class SpaceFix:
     ----------
     pose : SpacePose
     covariance : ndarray, shape (6, 6)
-        Of x, y, z, heading, pitch and roll, mm and rad. Infinite variances if the LEDs do not tell
-        all; useless for the angles where the tracker looks straight up or down.
+        Of x, y, z, heading, pitch and roll, mm and rad; useless for the angles where the tracker
+        looks straight up or down.
     residuals : ndarray, shape (cameras, N)
         Measured minus expected, px, of rejected spikes too; NaN where there is none.
     rejected : ndarray of bool, shape (cameras, N)
@@ -158,12 +174,14 @@ def locate_in_space(
 ) -> SpaceFix:
     """Pose from the spikes of LEDs at known places on several line sensors.
 
-    Begins, unless told where, with the closed-form poses of three LEDs that two sensors see, goes
-    on with weighted least squares of all spikes, and takes the pose that fits best. The sensors'
-    common height coupling is solved, not assumed: each tells the other how high LEDs are.
+    Begins with the closed-form poses of three LEDs that two sensors see, and where it is told to,
+    goes on with weighted least squares of all spikes, and takes the pose that fits best. What LEDs
+    near one plane look like when they are tilted the other way is always tried: from afar it is
+    nearly the same. The sensors' common height coupling is solved, not assumed: each tells the
+    other how high LEDs are.
 
-    A fit that is less likely than 1 in 10⁴ is repeated without the spikes that disagree with the
-    others, if these are less than a third.
+    A fit that is less likely than 1 in 10⁴, or has a spike 4 σ off what the others say, is repeated
+    without the spikes that disagree with the others, as few as will do and at most a third.
 
     Parameters
     ----------
@@ -175,52 +193,67 @@ def locate_in_space(
         Spikes and their standard deviations, px; NaN, or infinite σ, where a sensor does not see an
         LED. A camera's `model_error` is added to σ, squares to squares.
     start : SpacePose, optional
-        Where to begin, as from the last fix; then three LEDs need not be seen by two sensors.
+        Where to begin, too, as from the last fix; then three LEDs need not be seen by two sensors.
+        With three LEDs, the pose to which this leads is taken.
 
     Returns
     -------
     SpaceFix
-        AMBIGUOUS with three LEDs, or if another pose fits about as well; REJECTED if gross errors
-        were left out; INCONSISTENT if residuals are too large for σ.
+        AMBIGUOUS with three LEDs, or if another pose fits about as well, be it without other
+        spikes; REJECTED if gross errors were left out; INCONSISTENT if residuals are too large for
+        σ; UNCHECKED, as with four LEDs and often with five, if the others do not tell of every spike
+        whether it is wrong.
 
     Raises
     ------
     ValueError
-        If there are fewer than three LEDs or six spikes, shapes do not match, or no pose has the
-        LEDs in front.
+        If there are fewer than three LEDs or six spikes, shapes do not match, no pose has the LEDs
+        in front, or the spikes do not tell all six numbers, as of LEDs on one line.
     """
     problem = _Problem.of(cameras, positions, pixels, sigma)
-    chosen = problem.everything
-    if start is None:
-        fits = problem.fits(chosen)
-    else:
-        fit = problem.refined(_state(start), chosen)
-        fits = [fit] if math.isfinite(fit.chi2) else []
-    degrees, flags = problem.degrees(chosen), PoseFlags.NONE
-    if not (fits and fits[0].chi2 <= _limit(degrees, REFUSED)):
-        found = problem.consensus()
-        if found is not None:
-            fits, chosen = [found[0]], found[1]
-            degrees = problem.degrees(chosen)
-            flags |= PoseFlags.NONE if chosen.all() else PoseFlags.REJECTED
-    if not fits:
+    fits = problem.fits(problem.everything, None if start is None else _state(start))
+    choices = [_Choice(fit, problem.everything) for fit in fits]
+    flags = PoseFlags.NONE
+    if not (choices and problem.agree(choices[0])):
+        fewer = problem.without_gross_errors([fit.state for fit in fits])
+        if fewer:
+            choices = fewer
+            flags |= PoseFlags.NONE if fewer[0].chosen.all() else PoseFlags.REJECTED
+    if not choices:
         raise ValueError(
             "no pose has the LEDs in front: are spikes and LEDs in the same order, and is the roll "
             "of the mounts right?"
         )
-    if not fits[0].chi2 <= _limit(degrees, INCONSISTENT):
+    best = choices[0]
+    if not best.fit.chi2 <= _limit(problem.degrees(best.chosen), INCONSISTENT):
         flags |= PoseFlags.INCONSISTENT
-    rivals = [fit for fit in fits[1:] if fit.chi2 <= _limit(degrees, PLAUSIBLE)]
-    if rivals or len(np.unique(problem.led[chosen])) < 4:
+    if len(np.unique(problem.led[best.chosen])) < 4 or any(
+        problem.rivals(best, other) for other in choices[1:]
+    ):
         flags |= PoseFlags.AMBIGUOUS
-    return problem.fix(fits[0], chosen, flags)
+    left = problem.left(best)[best.chosen]
+    if (AGREES**2 * (1 - left) > HIDDEN**2 * left).any():
+        flags |= PoseFlags.UNCHECKED
+    return problem.fix(best, flags)
 
 
 _TRIPLES = 4
 """How many sets of three LEDs a fit is begun with."""
 
+_FEW = 5
+"""LEDs up to which poses other than the one begun with, and that tilted the other way, may fit."""
+
 _TRIES = 20
 """How many, where gross errors are looked for."""
+
+_BASES = 3
+"""Fits of all spikes from which those with one left out are begun."""
+
+_FEWEST = 7
+"""Spikes, of which one says whether the others agree."""
+
+_CLOSE = 9.0
+"""χ² by which a pose may fit worse and still count as about as good: 90 times less likely."""
 
 _STEPS = 40
 """Of least squares, at most; from a pose that is nearly right it takes 4 to 6."""
@@ -238,9 +271,14 @@ class _Fit(NamedTuple):
     state: _State
 
 
+class _Choice(NamedTuple):
+    """A fit of some of the spikes."""
+
+    fit: _Fit
+    chosen: NDArray[np.bool_]
+
+
 def _state(pose: SpacePose) -> _State:
-    for name in ("x", "y", "z", "heading", "pitch", "roll"):
-        check.number(f"start.{name}", getattr(pose, name))
     return _State(np.array([pose.x, pose.y, pose.z]), rotation(pose.heading, pose.pitch, pose.roll))
 
 
@@ -283,6 +321,12 @@ class _Problem:
             raise ValueError(
                 f"{len(led)} spikes of {len(np.unique(led))} LEDs: a pose in space needs three LEDs "
                 "that two sensors see"
+            )
+        width = np.linalg.svd(points[led] - points[led].mean(axis=0), compute_uv=False)
+        if width[1] <= _ON_LINE * width[0]:
+            raise ValueError(
+                f"positions {points[np.unique(led)].tolist()} lie on one line: the tracker may be "
+                "anywhere on a circle around it"
             )
         rolls = np.array([cameras[i].roll for i in np.unique(sensor)])
         if not (np.abs(np.sin(rolls[:, None] - rolls[None, :])) > _PARALLEL).any():
@@ -363,34 +407,126 @@ class _Problem:
             damping *= 10
         return _Fit(chi2, state)
 
-    def fits(self, chosen: NDArray[np.bool_]) -> list[_Fit]:
+    def fits(self, chosen: NDArray[np.bool_], start: _State | None) -> list[_Fit]:
         """Least squares from several beginnings: different poses, the best first."""
         found: list[_Fit] = []
-        for _, states in itertools.islice(self.beginnings(chosen), _TRIPLES):
-            for state in states:
-                fit = self.refined(state, chosen)
-                if math.isfinite(fit.chi2) and not any(_same(fit, other) for other in found):
-                    found.append(fit)
-            found.sort(key=lambda fit: fit.chi2)
-            if found and found[0].chi2 <= _limit(self.degrees(chosen), REFUSED):
-                break  # all poses that fit these three LEDs were tried
+
+        def begin(state: _State) -> None:
+            fit = self.refined(state, chosen)
+            if math.isfinite(fit.chi2) and not any(_same(fit, other) for other in found):
+                found.append(fit)
+
+        degrees = self.degrees(chosen)
+        enough = _limit(degrees, REFUSED)
+        if start is not None:
+            begin(start)
+        many = len(np.unique(self.led[chosen])) > _FEW
+        if not (many and found and found[0].chi2 <= enough):
+            for _, states in itertools.islice(self.beginnings(chosen), _TRIPLES):
+                for state in states:
+                    begin(state)
+                if any(fit.chi2 <= enough for fit in found):
+                    break  # all poses that fit these three LEDs were tried
+        if found:
+            begin(self.mirrored(min(found, key=lambda fit: fit.chi2).state, chosen))
+        # without redundancy all fits are as good, and what was told to begin with decides
+        found.sort(key=lambda fit: fit.chi2 if degrees > 0 else float(fit.chi2 > enough))
         return found
 
-    def consensus(self) -> tuple[_Fit, NDArray[np.bool_]] | None:
-        """Fit and choose spikes that agree, at least two thirds of them, if there are such."""
+    def mirrored(self, state: _State, chosen: NDArray[np.bool_]) -> _State:
+        """Pose from which LEDs of one plane look much the same, tilted the other way.
+
+        Depth along the line of sight is reversed, which a plane's reflection in itself undoes.
+        """
+        leds = self.positions[np.unique(self.led[chosen])]
+        middle = leds.mean(axis=0)
+        own = (middle - state.place) @ state.axes
+        sight = own / np.linalg.norm(own)
+        normal = np.linalg.svd(leds - middle)[2][-1]
+        axes = state.axes - 2 * np.outer(normal, normal @ state.axes)
+        axes -= 2 * np.outer(axes @ sight, sight)
+        return _State(middle - axes @ own, axes)
+
+    def without_gross_errors(self, states: list[_State]) -> list[_Choice]:
+        """Fits of as many spikes as agree, at least two thirds: the best first, none if none do.
+
+        Parameters
+        ----------
+        states : list of _State
+            Fits of all spikes, the best first.
+        """
+        found: list[_Choice] = []
+
+        def add(fit: _Fit, chosen: NDArray[np.bool_]) -> None:
+            if fit.chi2 <= _limit(self.degrees(chosen), INCONSISTENT) and not any(
+                (chosen == other.chosen).all() and _same(fit, other.fit) for other in found
+            ):
+                found.append(_Choice(fit, chosen))
+
+        # a single one may be any: where few are left, several fit without it
+        if len(self.led) > _FEWEST:
+            for wrong in range(len(self.led)):
+                chosen = np.arange(len(self.led)) != wrong
+                for state in states[:_BASES]:
+                    add(self.refined(state, chosen), chosen)
+        if not found:
+            for fit, chosen in self.consensus():
+                add(fit, chosen)
+        if not found:
+            return []
+        most = max(choice.chosen.sum() for choice in found)
+        for fit, chosen in [choice for choice in found if choice.chosen.sum() == most]:
+            add(self.refined(self.mirrored(fit.state, chosen), chosen), chosen)
+        found = [choice for choice in found if choice.chosen.sum() == most]
+        return sorted(found, key=lambda choice: choice.fit.chi2)
+
+    def consensus(self) -> Iterator[_Choice]:
+        """Fits of spikes that agree with three LEDs, for many of these."""
         for triple, states in itertools.islice(self.beginnings(self.everything), _TRIES):
             three = np.isin(self.led, triple)
             for state in states:
                 fit, chosen = self.refined(state, three), three
                 for _ in range(2):
                     chosen = self.agreeing(fit.state, chosen)
-                    if 3 * chosen.sum() < 2 * len(chosen) or chosen.sum() < 7:
+                    if 3 * chosen.sum() < 2 * len(chosen) or chosen.sum() < _FEWEST:
                         break
                     fit = self.refined(fit.state, chosen)
                 else:
-                    if fit.chi2 <= _limit(self.degrees(chosen), REFUSED):
-                        return fit, chosen
-        return None
+                    yield _Choice(fit, chosen)
+
+    def left(self, choice: _Choice) -> NDArray[np.float64]:
+        """Part of an error of each spike that is left in its residual, (K,)."""
+        modelled = self.model(choice.fit.state)
+        covariance = self.turned_covariance(choice.fit.state, choice.chosen)
+        if modelled is None or covariance is None:
+            return np.zeros(len(self.led))
+        slopes = modelled[1] / self.sigma[:, None]
+        return np.asarray(1 - np.einsum("ki,ij,kj->k", slopes, covariance, slopes))
+
+    def agree(self, choice: _Choice) -> bool:
+        """Whether a fit of all spikes is likely, and none is off what the others say."""
+        if not choice.fit.chi2 <= _limit(self.degrees(choice.chosen), REFUSED):
+            return False
+        modelled, left = self.model(choice.fit.state), self.left(choice)
+        if modelled is None:
+            return False
+        off = ((self.pixels - modelled[0]) / self.sigma) ** 2
+        return bool((off <= AGREES**2 * left)[left > ROUNDING].all())
+
+    def rivals(self, best: _Choice, other: _Choice) -> bool:
+        """Whether another fit may be the right one, and the best one does not allow for it."""
+        likely = max(_limit(self.degrees(other.chosen), PLAUSIBLE), best.fit.chi2 + _CLOSE)
+        if other.fit.chi2 > likely:
+            return False
+        one = self.turned_covariance(best.fit.state, best.chosen)
+        if one is None:
+            return True
+        (place, axes), (there, turned) = best.fit.state, other.fit.state
+        swung = axes.T @ turned - turned.T @ axes  # twice the sine of the angle, about an axis
+        away = np.array([*(there - place), *(swung[[2, 0, 1], [1, 2, 0]] / 2)])
+        if np.trace(axes.T @ turned) < 1:  # by more than a quarter turn
+            return True
+        return bool(away @ np.linalg.solve(one, away) > _limit(6, PLAUSIBLE))
 
     def agreeing(self, state: _State, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Spikes that agree with a pose fitted to some of them, which is not exact."""
@@ -461,26 +597,28 @@ class _Problem:
         root = turn.T / strength / size[:, None]
         return np.asarray(root @ root.T)
 
-    def fix(self, fit: _Fit, chosen: NDArray[np.bool_], flags: PoseFlags) -> SpaceFix:
+    def fix(self, choice: _Choice, flags: PoseFlags) -> SpaceFix:
         """What is told of a fit."""
+        fit, chosen = choice
         place, axes = fit.state
         heading, pitch, roll = angles(axes)
         covariance = self.turned_covariance(fit.state, chosen)
         if covariance is None:
-            flags |= PoseFlags.AMBIGUOUS
-            covariance = np.diag(np.full(6, math.inf))
-        else:
-            # ω in the tracker's frame = rates @ changes of heading, pitch, roll
-            rates = np.array(
-                [
-                    [math.cos(pitch) * math.sin(roll), math.cos(roll), 0.0],
-                    [math.cos(pitch) * math.cos(roll), -math.sin(roll), 0.0],
-                    [-math.sin(pitch), 0.0, 1.0],
-                ]
+            raise ValueError(
+                f"{chosen.sum()} spikes of LEDs at {self.positions[np.unique(self.led)].tolist()} "
+                "do not tell all six numbers from where the tracker is: add LEDs, in depth"
             )
-            change = np.eye(6)
-            change[3:, 3:] = np.linalg.pinv(rates)
-            covariance = change @ covariance @ change.T
+        # ω in the tracker's frame = rates @ changes of heading, pitch, roll
+        rates = np.array(
+            [
+                [math.cos(pitch) * math.sin(roll), math.cos(roll), 0.0],
+                [math.cos(pitch) * math.cos(roll), -math.sin(roll), 0.0],
+                [-math.sin(pitch), 0.0, 1.0],
+            ]
+        )
+        change = np.eye(6)
+        change[3:, 3:] = np.linalg.pinv(rates)
+        covariance = change @ covariance @ change.T
         modelled = self.model(fit.state)
         assert modelled is not None  # noqa: S101  # of a fit it is not
         residuals = np.full(self.shape, math.nan)
@@ -572,6 +710,9 @@ _FREE = 1e-6
 _PARALLEL = 0.1
 """Sine of the angle below which two lines count as parallel."""
 
+_ON_LINE = 1e-9
+"""Width of LEDs relative to their length below which they lie on one line: rounding."""
+
 _SINGULAR = 1e-9
 """Part of the information that is left where a pose is not told."""
 
@@ -598,13 +739,6 @@ def _same(one: _Fit, other: _Fit) -> bool:
         np.abs(one.state.place - other.state.place).max() < 0.1
         and np.abs(one.state.axes - other.state.axes).max() < 1e-4
     )
-
-
-def _limit(degrees: int, probability: float) -> float:
-    """χ² that is exceeded with this probability; of an exact fit, what rounding may leave."""
-    from scipy.special import chdtri  # type: ignore[import-untyped]  # slow to load
-
-    return float(chdtri(degrees, probability)) if degrees > 0 else 1e-6
 
 
 def _points(positions: ArrayLike) -> NDArray[np.float64]:

@@ -1,11 +1,12 @@
 """Two sensors on one tracker: two microcontrollers with the real firmware, one line that syncs them.
 
 Each head has a board and a link of its own, as on a Raspberry Pi with both SPI buses in use. The
-boards run on one virtual time: they are switched on together, and an edge of the sync line comes to
-both at the same time, whatever their hosts are doing. Their clocks are one: of real boards, each on
-its own RC oscillator, that is not true without a wire. One board drives the LEDs; the other takes the
-same command, so that its own outputs, wired to nothing, switch with the first one's, and the light on
-its sensor follows them.
+boards run on one virtual time: an edge of the sync line comes to both at the same time, whatever
+their hosts are doing. Their clocks are one: of real boards, each on its own RC oscillator, that is
+not true without a wire. One board drives the LEDs; the other takes the same command, and the light
+on its sensor follows its own outputs, which are wired to nothing. That stands for the first one's
+light as long as both switch alike, and `TwinPair.capture` sees to it that they do: the same LEDs in
+each exposure, for as long but for `ALIKE`, and exposures that end at the same cycle.
 """
 
 from __future__ import annotations
@@ -18,8 +19,9 @@ import numpy as np
 
 from acquisition.capture import Capture
 from acquisition.frames import Frame
+from acquisition.links import LinkError
 from twin.link import TwinLink
-from twin.machine import TICKS
+from twin.machine import CLOCK, TICKS
 from twin.world import STRAIGHT, Mount
 
 if TYPE_CHECKING:
@@ -37,6 +39,9 @@ SYNC = "PB1"
 
 PULSE = 1e-4
 """Length of a pulse of the sync line, s."""
+
+ALIKE = 5e-7
+"""Difference of the times for which an LED is lit, s: an interrupt that the link delays is 60 ns late."""
 
 
 class SyncedLink(TwinLink):
@@ -163,13 +168,14 @@ class TwinPair:
         Raises
         ------
         LinkError
-            From a link.
+            From a link, or if the boards did not expose at the same times or light the same LEDs.
         ValueError
             If the delay is out of its range.
         """
         if not 0.02 <= delay <= 0.2:
             raise ValueError(f"delay = {delay:g} s: allowed is 0.02 to 0.2; in ms?")
         self.sync(delay)
+        begun = max(link.machine.time for link in self.links) + round(delay * CLOCK)
         started = replace(command, await_sync=True)
         with ExitStack() as stack:
             captures = [stack.enter_context(closing(Capture(k, started))) for k in self.links]
@@ -186,7 +192,35 @@ class TwinPair:
                         frame if frame.sequence == newest else next(capture, None)
                         for frame, capture in zip(there, captures, strict=True)
                     ]
+                begun = self._check_alike(begun)
                 yield tuple(there)
+
+    def _check_alike(self, begun: int) -> int:
+        """Compare the exposures that ended after a time, in cycles; return the end of the last one."""
+        # one board may be ahead, and only so many read-outs are kept
+        logs = [link.machine.readouts for link in self.links]
+        ended = min(link.machine.time for link in self.links)
+        begun = max([begun, *(int(log["transfer"][0]) - 1 for log in logs)])
+        logs = [log[(log["transfer"] > begun) & (log["start"] < ended)] for log in logs]
+        first = logs[0]
+        for number, log in enumerate(logs[1:], 1):
+            if log["transfer"].tolist() != first["transfer"].tolist():
+                raise LinkError(
+                    f"exposures of board 0 ended at {first['transfer'].tolist()} cycles, of board "
+                    f"{number} at {log['transfer'].tolist()}: did both get the edge of the sync line?"
+                )
+            # of sources 0 is what is always there
+            apart = np.abs(
+                log["lit"][:, 1:].astype(np.int64) - first["lit"][:, 1:].astype(np.int64)
+            )
+            if apart.size and apart.max() > ALIKE * CLOCK:
+                at, channel = np.unravel_index(apart.argmax(), apart.shape)
+                raise LinkError(
+                    f"LED {channel} was lit for {first['lit'][at, 1 + channel]} cycles by board 0, "
+                    f"and as long as {log['lit'][at, 1 + channel]} by board {number}, which sees it "
+                    "only if both light it"
+                )
+        return int(first["transfer"][-1]) if len(first) else begun
 
     def close(self) -> None:
         """Free the emulators."""

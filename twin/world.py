@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
+from numbers import Integral
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,6 +28,12 @@ if TYPE_CHECKING:
 
 LUMINOUS_EFFICACY = 683.0  # lm/W at 555 nm
 CLOSEST = 20.0  # mm from the first vertex: nearer ones are not seen
+_ON_WALL = 1e-9  # of a way: where it begins
+
+
+def _angle(name: str, value: float) -> None:
+    if abs(check.number(name, value, "rad")) > math.tau:
+        raise ValueError(f"{name} = {value:g} rad: allowed are −2π to 2π; was it given in degrees?")
 
 
 @dataclass(frozen=True)
@@ -67,7 +74,7 @@ class Led:
         check.positive("wavelength", self.wavelength, "µm")
         if self.wavelength > 20:
             raise ValueError(f"wavelength = {self.wavelength:g} µm: was it given in nm?")
-        check.number("facing", self.facing)
+        _angle("facing", self.facing)
         check.not_negative("extent", self.extent, "a diameter in mm")
 
     def intensity(self, x: float, y: float, z: float) -> float:
@@ -100,7 +107,8 @@ class Pose:
     x, y : float
         mm.
     heading : float
-        rad, counter-clockwise seen from above; 0 looks along −y.
+        rad, counter-clockwise seen from above; 0 looks along −y. Angles are −2π to 2π: one that
+        turns on and on is wrapped by ``math.remainder(angle, math.tau)``.
     z : float
         mm.
     pitch : float
@@ -117,8 +125,10 @@ class Pose:
     roll: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("x", "y", "heading", "z", "pitch", "roll"):
-            check.number(name, getattr(self, name))
+        for name in ("x", "y", "z"):
+            check.number(name, getattr(self, name), "mm")
+        for name in ("heading", "pitch", "roll"):
+            _angle(name, getattr(self, name))
 
     @property
     def rotation(self) -> NDArray[np.float64]:
@@ -157,7 +167,7 @@ class Mount:
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        check.number("roll of the mount", self.roll, "rad")
+        _angle("roll of the mount", self.roll)
         if len(self.offset) != 3:
             raise ValueError(f"offset = {self.offset}: right, up and backward in mm are needed")
         for value in self.offset:
@@ -170,14 +180,14 @@ STRAIGHT = Mount()
 
 @dataclass(frozen=True)
 class Wall:
-    """A vertical mirror: every LED before it has an image behind it.
+    """A vertical mirror: every LED before it has an image behind it, and none is seen through it.
 
     Parameters
     ----------
     start, end : tuple of float
-        Room x and y of its ends, mm. It shines on both sides, at any height.
+        Room x and y of its ends, mm. It shines on both sides, and hides, at any height.
     reflectivity : float
-        0 to 1: a window 0.1, varnish 0.05, a mirror 0.9.
+        0 to 1: a window at night 0.1, varnish 0.05, a mirror 0.9; 0 only hides.
     """
 
     start: tuple[float, float]
@@ -210,15 +220,46 @@ class Wall:
 
     def shows(self, image: Led, x: float, y: float) -> bool:
         """Whether the way from an image to a point of the room in mm passes through the wall."""
+        return self._meets(image.position, (x, y)) is not None
+
+    def hides(self, led: Led, x: float, y: float, mirror: Wall | None = None) -> bool:
+        """Whether it stands between an LED and a point of the room in mm.
+
+        Parameters
+        ----------
+        led : Led
+            Or an image of one.
+        x, y : float
+            The point.
+        mirror : Wall, optional
+            Which the image is in: light comes from the LED to there, then to the point.
+        """
+        if mirror is None:
+            return self._meets(led.position, (x, y)) is not None
+        if mirror is self:
+            return False
+        share = mirror._meets(led.position, (x, y))
+        if share is None:
+            return False
+        at = (
+            led.position[0] + share * (x - led.position[0]),
+            led.position[1] + share * (y - led.position[1]),
+        )
+        there = mirror.image(led).position  # back to the LED itself
+        return self._meets(at, (x, y)) is not None or self._meets(there, at) is not None
+
+    def _meets(self, begin: Sequence[float], end: Sequence[float]) -> float | None:
+        """How far on the way from one place to another it is met: 0 to 1, without the ends."""
         along = (self.end[0] - self.start[0], self.end[1] - self.start[1])
-        way = (x - image.position[0], y - image.position[1])
-        gap = (self.start[0] - image.position[0], self.start[1] - image.position[1])
+        way = (end[0] - begin[0], end[1] - begin[1])
+        gap = (self.start[0] - begin[0], self.start[1] - begin[1])
         across = way[0] * along[1] - way[1] * along[0]
         if across == 0:
-            return False  # along the wall
+            return None  # along the wall
         on_way = (gap[0] * along[1] - gap[1] * along[0]) / across
         on_wall = (gap[0] * way[1] - gap[1] * way[0]) / across
-        return 0 < on_way < 1 and 0 <= on_wall <= 1
+        # an LED on the wall is before it, whatever rounding says
+        return on_way if _ON_WALL < on_way < 1 - _ON_WALL and 0 <= on_wall <= 1 else None
 
     @property
     def _direction(self) -> float:
@@ -290,8 +331,12 @@ def _drawn(seed: int, slot: int, share: float) -> frozenset[int]:
 
 def _channels(channels: Collection[int]) -> Collection[int]:
     for channel in channels:
-        if not 0 <= channel < CHANNELS:
-            raise ValueError(f"LED channel = {channel}: allowed are 0 to {CHANNELS - 1}")
+        value: object = channel  # 1.0 and True would pass for whole numbers
+        whole = isinstance(value, Integral) and not isinstance(value, bool)
+        if not whole or not 0 <= channel < CHANNELS:
+            raise ValueError(
+                f"LED channel = {channel!r}: allowed are 0 to {CHANNELS - 1}, whole numbers"
+            )
     return channels
 
 
@@ -318,7 +363,8 @@ class World:
     mount : Mount
         Of the head on the tracker; straight when left out.
     walls : sequence of Wall
-        That reflect; one reflection is followed, not those of reflections.
+        That reflect, and hide what is behind them; one reflection is followed, not those of
+        reflections.
     occlusions : sequence of Occlusion, or callable
         What hides LEDs: when, or a function from seconds to the channels hidden. In the twin it is
         asked when an LED goes on and when a read-out starts.
@@ -417,6 +463,8 @@ class World:
         places = self._seen(self._positions, pose).tolist()
         for (led, wall), place in zip(self._sources, places, strict=True):
             if led.channel in hidden or (wall and not wall.shows(led, eye[0], eye[1])):
+                continue
+            if any(other.hides(led, eye[0], eye[1], wall) for other in self.walls):
                 continue
             light = self._light(led, (place[0], place[1], place[2]), led.intensity(*eye))
             if light is not None:

@@ -131,12 +131,38 @@ def test_points_behind_have_no_spike() -> None:
     ]
 
 
+def test_beyond_the_fold_there_is_no_tangent() -> None:
+    """The polynomial x (1 − 0.418 x²) rises as far as 0.893, where it is 0.595."""
+    camera = Camera(4189.0, 1823.5, (-0.418,))
+    fold = 1823.5 + 4189 * 0.5953
+    inside = np.array([-600.0, 0.0, 3647.0, fold - 5])
+    m = camera.tangent(inside)
+    assert np.abs(m).max() < 0.893
+    np.testing.assert_allclose(camera.project(np.stack([-m, 0 * m, 1 + 0 * m], -1)), inside)
+    assert np.isnan(camera.tangent([-900.0, fold + 5, 5000.0, 1e5])).all()
+    assert np.isnan(camera.tangent(1e5))
+
+
+def test_a_point_whose_spike_is_folded_or_light_too_steep_is_not_seen() -> None:
+    camera = Camera(4189.0, 1823.5, (-0.418,), elevation=0.3)
+    points = np.array([[-300.0, 0.0, 1000.0], [-1500.0, 0.0, 1000.0], [1600.0, 0.0, 1000.0]])
+    assert ((camera.project(points) >= 0) & (camera.project(points) < 3648)).all()
+    assert camera.sees(points).tolist() == [True, False, False]
+    high = [[100.0, y, 1000.0] for y in (-299.0, 299.0, 301.0, -900.0)]
+    assert camera.sees(high).tolist() == [True, True, False, False]
+
+
 def test_a_camera_travels_in_a_file() -> None:
     camera = replace(FULL, model_error=0.0801, elevation=0.37)
     assert Camera.from_dict(json.loads(json.dumps(camera.to_dict()))) == camera
     data = camera.to_dict()
     with pytest.raises(ValueError, match="unknown or missing: focal_length"):
         Camera.from_dict({**data, "focal_length": 28.0})
+    with pytest.raises(TypeError, match=r"camera: names and numbers are needed, not \[1\]"):
+        Camera.from_dict([1])  # type: ignore[arg-type]
+    for wrong in (0.1, None, "0.1"):
+        with pytest.raises(TypeError, match=r"distortion = .*: a list of numbers is needed"):
+            Camera.from_dict({**data, "distortion": wrong})
     del data["pupil"]
     with pytest.raises(ValueError, match="unknown or missing: pupil"):
         Camera.from_dict(data)
@@ -150,6 +176,7 @@ def test_a_camera_travels_in_a_file() -> None:
         ({"scale": 3500.0, "distortion": (0.0,) * 5}, "distortion has 5 terms: allowed are 4"),
         ({"scale": 3500.0, "coupling": (float("nan"),)}, r"coupling\[0\] = nan"),
         ({"scale": 3500.0, "model_error": -1.0}, "model_error = -1"),
+        ({"scale": 3500.0, "elevation": 0.0}, "elevation = 0"),
     ],
 )
 def test_impossible_cameras_are_refused(numbers: dict[str, Any], message: str) -> None:
@@ -189,6 +216,39 @@ def test_the_scatter_of_a_fit_is_that_of_its_covariance() -> None:
     )
     # 250 runs tell a standard deviation to 4.5 %
     np.testing.assert_allclose(found.std(axis=0), expected, rtol=0.18)
+
+
+def test_the_models_error_is_not_the_noises() -> None:
+    """Of spikes whose σ is given, only what the model cannot follow is left; it is unbiased."""
+    true = Camera(4200.0, 1815.0, (-0.42, 0.19), pupil=-3.0)
+    rng = np.random.default_rng(10)
+    points = field(40, 11, elevation=0.0)
+    sigma = rng.uniform(0.1, 0.5, 40)
+    fits = []
+    for error in (0.0, 0.4):
+        found = []
+        for _ in range(150):
+            # what no term of the model is: another error at each place
+            spikes = true.project(points) + sigma * rng.normal(size=40)
+            found.append(Camera.fit(points, spikes + error * rng.normal(size=40), sigma))
+        fits.append(np.array([camera.model_error for camera in found]))
+    assert np.median(fits[0]) < 0.1  # of 0.32 px of noise
+    assert np.sqrt(np.mean(fits[1] ** 2)) == pytest.approx(0.4, rel=0.06)
+    # without σ all that is left is the model's, as large as of spikes not fitted
+    few = [
+        Camera.fit(points[:9], true.project(points[:9]) + rng.normal(0, 0.3, 9)).model_error
+        for _ in range(300)
+    ]
+    assert np.sqrt(np.mean(np.square(few))) == pytest.approx(0.3, rel=0.08)
+    assert Camera.fit(points[:5], true.project(points[:5])).model_error == 0
+
+
+def test_an_elevation_that_is_given_is_taken_or_refused() -> None:
+    points = field(50, 12)
+    spikes = FULL.project(points)
+    assert Camera.fit(points, spikes, pupil=-12.0, elevation=0.25).elevation == 0.25
+    with pytest.raises(ValueError, match="elevation = 0"):
+        Camera.fit(points, spikes, pupil=-12.0, elevation=0.0)
 
 
 def test_a_fit_refuses_what_points_do_not_tell() -> None:

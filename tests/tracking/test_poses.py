@@ -9,7 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
+from raytransfer.designs import DESIGNS
+from raytransfer.irradiance import irradiance
 from raytransfer.localisation import pinhole_jacobian, pose_bound
+from raytransfer.sources import Emitter
 from raytransfer.studies import room_to_optical
 from tracking.camera import Camera
 from tracking.leds import LedMap
@@ -24,6 +27,7 @@ from tracking.poses import (
     pose_jacobian,
     two_leds,
 )
+from tracking.spikes import SpikeFinder
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -234,7 +238,8 @@ def test_any_height_that_light_comes_from_is_believed() -> None:
     # that it is 300 mm away, the spikes tell; above or below, they do not
     assert fix.height == pytest.approx(0.0, abs=1.0)
     assert fix.sigma_height == pytest.approx(300.0, abs=15.0)
-    assert not fix.flags
+    # with four numbers to tell, nine LEDs do not check each other
+    assert fix.flags == PoseFlags.UNCHECKED
 
 
 def test_gross_errors_are_found_and_left_out() -> None:
@@ -261,7 +266,7 @@ def test_of_four_spikes_it_is_not_known_which_one_is_wrong() -> None:
     pixels = spikes_at(leds, 100.0, 3500.0, 0.02)
     pixels[1] += 20
     fix = locate(CAMERA, leds, pixels, 0.05)
-    assert fix.flags == PoseFlags.AMBIGUOUS | PoseFlags.INCONSISTENT
+    assert fix.flags == PoseFlags.AMBIGUOUS | PoseFlags.INCONSISTENT | PoseFlags.UNCHECKED
     # a known heading leaves one to spare
     fix = locate(CAMERA, leds, pixels, 0.05, heading=Prior(0.02, 0.0))
     assert fix.rejected.tolist() == [False, True, False, False]
@@ -285,28 +290,29 @@ def test_leds_and_tracker_on_a_circle_are_a_danger(count: int) -> None:
     for place in (1.2, 1.57, 1.9):
         x, y = middle + radius * np.array([math.cos(place), math.sin(place)])
         fix = locate(CAMERA, leds, spikes_at(leds, x, y, 0.05), 0.05, start=(x, y, 0.05))
-        assert fix.flags == PoseFlags.DANGER_CIRCLE
+        assert fix.flags & ~PoseFlags.UNCHECKED == PoseFlags.DANGER_CIRCLE
         assert not fix.covariance[0, 0] < 1e6  # mm²
         # no danger if the heading is known, or away from it
         turned = locate(CAMERA, leds, spikes_at(leds, x, y, 0.05), 0.05, heading=Prior(0.05, 0.0))
-        assert turned.flags == PoseFlags.HEADING_ASSUMED
+        assert turned.flags & ~PoseFlags.UNCHECKED == PoseFlags.HEADING_ASSUMED
         assert (turned.x, turned.y) == pytest.approx((x, y), abs=1e-6)
         away = locate(CAMERA, leds, spikes_at(leds, x, y + 600, 0.05), 0.05)
-        assert away.flags == PoseFlags.NONE
+        assert away.flags & ~PoseFlags.UNCHECKED == PoseFlags.NONE
 
 
 def test_two_leds_take_the_heading_that_is_given() -> None:
     leds = np.array([[-250.0, 0.0, 0.0], [250.0, 0.0, 0.0]])
     pixels = spikes_at(leds, 130.0, 2000.0, 0.1)
+    assumed = PoseFlags.HEADING_ASSUMED | PoseFlags.UNCHECKED
     fix = locate(CAMERA, leds, pixels, 0.1, heading=Prior(0.1, 0.0))
-    assert fix.flags == PoseFlags.HEADING_ASSUMED
+    assert fix.flags == assumed
     assert (fix.x, fix.y) == pytest.approx((130.0, 2000.0), abs=1e-6)
     # y σ / (√2 f) along x, √2 y² σ / (f B) along y
     unsure = locate(CAMERA, leds, pixels, 0.1, heading=Prior(0.1, math.radians(1)))
-    assert unsure.flags == PoseFlags.HEADING_ASSUMED
+    assert unsure.flags == assumed
     assert math.sqrt(unsure.covariance[0, 0]) == pytest.approx(2000 * math.radians(1), rel=0.05)
     lost = locate(CAMERA, leds, pixels, 0.1)
-    assert lost.flags == PoseFlags.HEADING_ASSUMED | PoseFlags.AMBIGUOUS
+    assert lost.flags == assumed | PoseFlags.AMBIGUOUS
     assert np.isinf(np.diag(lost.covariance)).all()
 
 
@@ -333,6 +339,15 @@ def test_spikes_that_are_missing_are_left_out() -> None:
         ({"sigma": 0.0}, r"sigma = 0 px: allowed is > 0"),
         ({"heading": Prior(20.0, 0.0)}, "heading.value = 20 rad: .*in degrees"),
         ({"height": Prior(0.0, -1.0)}, "height.sigma = -1"),
+        ({"heading": Prior(0.0, 5.0)}, "heading.sigma = 5 rad: .*in degrees"),
+        ({"start": (0.0, 4000.0, 10.0)}, r"start\[2\] = 10 rad: .*in degrees"),
+        ({"start": (0.0, 4000.0)}, "start is x, y and heading, not 2 numbers"),
+        ({"positions": WALL / 1000}, "LEDs are 2.4 mm apart at most: .*in metres"),
+        ({"pixels": np.arange(9) * 200.0 + 1e6}, r"a spike at 1e\+06 px: the line has 3648"),
+        ({"sigma": np.array([math.nan] + [0.05] * 8)}, "sigma = nan px: .*infinite for a spike"),
+        ({"sigma": np.full((9, 1), 0.05)}, r"sigma is one number or has shape \(9,\)"),
+        ({"facings": 90.0}, "90 rad: .*in degrees"),
+        ({"facings": np.zeros(4)}, r"facings has shape \(9,\)"),
         ({"pixels": np.full(9, math.nan)}, "0 spikes: a pose needs 2"),
         (
             {"positions": WALL[::-1].copy(), "heading": Prior(0.0, 0.0)},
@@ -362,6 +377,176 @@ def test_bad_input_to_the_closed_forms_is_refused() -> None:
         two_leds(CAMERA, leds[:2], [1000.0, 2000.0], heading=10.0)
     with pytest.raises(ValueError, match=r"leds has shape \(2, 3\)"):
         two_leds(CAMERA, leds, [1000.0, 2000.0])
+
+
+@pytest.mark.parametrize("seed", [10, 11])
+def test_leds_that_are_not_seen_change_nothing(seed: int) -> None:
+    """Gross errors are told among few LEDs of a large map as well as among these alone."""
+    rng = np.random.default_rng(seed)
+    rest = np.column_stack([rng.uniform(-5000, 5000, (31, 2)), np.zeros(31)])
+    order = rng.permutation(40)
+    for _ in range(20):
+        pose = (rng.uniform(-300, 300), rng.uniform(3500, 4150), rng.uniform(-0.05, 0.05))
+        pixels = spikes_at(WALL, *pose) + rng.normal(0, 0.05, 9)
+        pixels[rng.choice(9, 2, replace=False)] += rng.uniform(3, 300, 2)
+        few = locate(CAMERA, WALL, pixels, 0.05)
+        assert few.flags & PoseFlags.REJECTED
+        # rows of the large map in any order, those that are seen in the same one
+        places = np.sort(order[:9])
+        leds, u = np.empty((40, 3)), np.full(40, math.nan)
+        leds[np.setdiff1d(order, places)] = rest
+        leds[places], u[places] = WALL, pixels
+        many = locate(CAMERA, leds, u, 0.05)
+        assert (many.x, many.y, many.heading) == (few.x, few.y, few.heading)
+        assert (many.covariance == few.covariance).all()
+        assert many.rejected[places].tolist() == few.rejected.tolist()
+        assert many.rejected.sum() == few.rejected.sum()
+        np.testing.assert_array_equal(many.residuals[places], few.residuals)
+        assert np.isnan(many.residuals).sum() == 31
+        assert (many.flags, many.degrees, many.chi2) == (few.flags, few.degrees, few.chi2)
+
+
+@pytest.mark.parametrize("count", [3, 9])
+@pytest.mark.parametrize("stagger", [0.0, 200.0])
+def test_leds_in_reversed_order_have_no_pose_on_their_lit_side(count: int, stagger: float) -> None:
+    leds = LedMap.line(count, 300.0, stagger)
+    spikes = spikes_at(leds.positions, 50.0, 4000.0, 0.02)
+    right = locate(CAMERA, leds.positions, spikes, 0.05, facings=leds.facings)
+    assert (right.x, right.y, right.heading) == pytest.approx((50.0, 4000.0, 0.02), abs=1e-5)
+    assert locate(CAMERA, leds.positions[::-1], spikes, 0.05).y < 0  # the pose behind
+    for wrong in (leds.positions[::-1], leds.positions * (-1, 1, 1)):
+        with pytest.raises(ValueError, match=r"on their lit side: .*in the same order"):
+            locate(CAMERA, wrong, spikes, 0.05, facings=leds.facings)
+    # a room turned by 130° is the same
+    turn = math.radians(130)
+    matrix = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+    turned = np.column_stack([leds.positions[:, :2] @ matrix.T, leds.positions[:, 2]])
+    fix = locate(CAMERA, turned, spikes, 0.05, facings=turn)
+    assert (fix.x, fix.y) == pytest.approx(tuple(matrix @ [50.0, 4000.0]), abs=1e-5)
+    with pytest.raises(ValueError, match="on their lit side"):
+        locate(CAMERA, turned[::-1], spikes, 0.05, facings=turn)
+
+
+def test_an_led_that_shines_away_is_a_gross_error() -> None:
+    leds = LedMap.line(9, 300.0, 200.0).positions
+    facings = np.zeros(9)
+    facings[3] = math.pi
+    fix = locate(CAMERA, leds, spikes_at(leds, 50.0, 4000.0, 0.02), 0.05, facings=facings)
+    assert fix.rejected.tolist() == [i == 3 for i in range(9)]
+    assert (fix.x, fix.y, fix.heading) == pytest.approx((50.0, 4000.0, 0.02), abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("count", "pitch", "warned"),
+    [(4, 500.0, True), (5, 350.0, True), (6, 350.0, True), (7, 350.0, True), (9, 300.0, False)],
+)
+def test_a_pose_that_a_hidden_gross_error_could_have_moved_says_so(
+    count: int, pitch: float, warned: bool
+) -> None:
+    """One spike of all is 5 to 30 σ off; a pose is far off if it is more than 7 σ."""
+    leds = LedMap.line(count, pitch, 200.0).positions
+    rng = np.random.default_rng(12)
+    far, missed, coverage = 0, 0, 0
+    runs = 400
+    warning = PoseFlags.UNCHECKED | PoseFlags.AMBIGUOUS | PoseFlags.INCONSISTENT
+    for _ in range(runs):
+        pose = (rng.uniform(-200, 200), rng.uniform(3300, 4150), rng.uniform(-0.03, 0.03))
+        pixels = spikes_at(leds, *pose) + rng.normal(0, 0.05, count)
+        clean = locate(CAMERA, leds, pixels, 0.05)
+        assert bool(clean.flags & PoseFlags.UNCHECKED) == warned or clean.rejected.any()
+        pixels[rng.integers(count)] += rng.choice([-1, 1]) * rng.uniform(5, 30) * 0.05
+        fix = locate(CAMERA, leds, pixels, 0.05)
+        error = np.array([fix.x, fix.y, fix.heading]) - pose
+        away = float(error @ np.linalg.solve(fix.covariance, error))
+        far += away > 49
+        missed += away > 49 and not fix.flags & warning
+        coverage += away < 7.815
+    assert missed == 0
+    if warned:
+        assert far > 0  # or the warning would be idle
+    else:
+        assert far == 0
+        assert coverage > 0.9 * runs
+
+
+def test_one_spike_that_disagrees_is_found_though_the_sum_is_not_unlikely() -> None:
+    leds = LedMap.line(24, 110.0, 200.0).positions
+    pixels = spikes_at(leds, 50.0, 4000.0, 0.02)
+    pixels[10] += 0.25  # 5 σ, χ² of 24 at 21 degrees
+    fix = locate(CAMERA, leds, pixels, 0.05)
+    assert np.flatnonzero(fix.rejected).tolist() == [10]
+    assert (fix.x, fix.y, fix.heading) == pytest.approx((50.0, 4000.0, 0.02), abs=1e-5)
+
+
+def test_a_vague_heading_is_no_witness_against_a_spike() -> None:
+    """Of four spikes it is as little known which one is wrong as without it."""
+    leds = LedMap.line(4, 500.0, 300.0).positions
+    pixels = spikes_at(leds, 100.0, 3500.0, 0.02)
+    pixels[1] += 20
+    for sigma in (0.05, 0.5, math.inf):
+        fix = locate(CAMERA, leds, pixels, 0.05, heading=Prior(0.0, sigma))
+        assert not fix.rejected.any()
+        assert fix.flags == PoseFlags.AMBIGUOUS | PoseFlags.INCONSISTENT | PoseFlags.UNCHECKED
+    told = locate(CAMERA, leds, pixels, 0.05, heading=Prior(0.02, 1e-5))
+    assert told.rejected.tolist() == [False, True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("stagger", "y", "sigma", "danger"),
+    [
+        (0.0, 4150.0, 0.02, False),  # a straight line has no circle in front of it
+        (-100.0, 2100.0, 0.02, False),
+        (-100.0, 2300.0, 0.02, False),
+        (-100.0, 2400.0, 0.02, True),
+        (-100.0, 2500.0, 0.02, True),  # on the circle
+    ],
+)
+def test_danger_is_where_the_covariance_misleads(
+    stagger: float, y: float, sigma: float, danger: bool
+) -> None:
+    leds = LedMap.line(3, 500.0, stagger).positions
+    clean = spikes_at(leds, 0.0, y, 0.0)
+    rng = np.random.default_rng(13)
+    runs = 300
+    flagged, inside, far = 0, 0, 0
+    for noise in rng.normal(0, sigma, (runs, 3)):
+        fix = locate(CAMERA, leds, clean + noise, sigma)
+        flagged += bool(fix.flags & PoseFlags.DANGER_CIRCLE)
+        error = np.array([fix.x, fix.y - y, fix.heading])
+        away = error @ np.linalg.lstsq(fix.covariance, error)[0]
+        inside += away < 7.815
+        far += away > 25
+    if danger:
+        assert flagged == runs
+        assert far > 0.005 * runs  # of honest errors 1.5e-5 are so far off
+    else:
+        assert flagged == 0
+        # 300 runs tell 95 % to 1.3 %
+        assert inside > 0.91 * runs
+        assert far == 0
+
+
+@pytest.mark.parametrize("height", [-450.0, -300.0, -200.0, 250.0, 400.0])
+@pytest.mark.parametrize("sigma", [0.005, 0.03])
+def test_both_heights_are_believed_if_one_is_less_likely(sigma: float, height: float) -> None:
+    """Above and below the LEDs is the same to the spikes: the prior decides how much each counts."""
+    rng = np.random.default_rng(14)
+    prior = Prior(100.0, 300.0)
+    pose = (rng.uniform(-100, 100), rng.uniform(3300, 4000), rng.uniform(-0.03, 0.03))
+    pixels = spikes_at(WALL, *pose, height) + rng.normal(0, sigma, 9)
+    fix = locate(CAMERA, WALL, pixels, sigma, height=prior)
+    # poses at all heights, each known, as likely as prior and spikes make it
+    heights = np.arange(-700.0, 700.0, 2.0)
+    fits = [locate(CAMERA, WALL, pixels, 30 * sigma, height=Prior(h, 0.0)) for h in heights]
+    chi2 = np.array([(f.residuals**2).sum() for f in fits]) / sigma**2
+    likely = np.exp(-(chi2 - chi2.min() + ((heights - prior.value) / prior.sigma) ** 2) / 2)
+    likely *= np.sqrt([np.linalg.det(f.covariance) for f in fits])
+    likely /= likely.sum()
+    mean = (likely * heights).sum()
+    spread = math.sqrt((likely * (heights - mean) ** 2).sum())
+    assert spread > 100  # both count
+    assert fix.height == pytest.approx(mean, abs=0.02 * spread)
+    assert fix.sigma_height == pytest.approx(spread, rel=0.02)
 
 
 def test_stagger_toward_the_tracker_tells_the_heading() -> None:
@@ -399,6 +584,8 @@ def test_dilution_is_the_bound_of_every_place() -> None:
         assert (found.x[index], found.y[index], found.heading[index]) == pytest.approx(
             (bound.sigma_x, bound.sigma_y, bound.sigma_heading), rel=1e-6
         )
+    # no light comes from above the reach of the head
+    assert np.isinf(dilution(CAMERA, WALL, 0.0, 2000.0, height=900.0).x)
     # one LED in view tells nothing
     assert np.isinf(dilution(CAMERA, WALL[:1], 0.0, 2000.0).x)
 
@@ -418,6 +605,28 @@ def test_a_degree_of_heading_hurts_two_leds_and_not_three(y: float, wrong: float
     errors = np.hypot([fix.x for fix in fixes], [fix.y - y for fix in fixes])
     assert np.sqrt(np.mean(errors**2)) < 1.0
     assert np.mean([fix.heading for fix in fixes]) == pytest.approx(turn, abs=1e-4)
+
+
+def test_a_degree_of_heading_hurts_in_exact_light_too() -> None:
+    """Neither position knows the camera that made the spikes: rays through the glass did."""
+    head = DESIGNS["slit-4mm"].system
+    camera = Camera.from_system(head, angles=17)
+    finder, emitter, turn = SpikeFinder(), Emitter(extent=2.0), math.radians(1)
+
+    def spike(point: NDArray[np.float64]) -> float:
+        light = irradiance(
+            head, emitter, tuple(point.tolist()), integration_time=1e-3, rays=(192, 64)
+        ).electrons
+        return finder.profile(24_500 * light / light.max()).position
+
+    pair = np.array([[-250.0, 0.0, 0.0], [250.0, 0.0, 0.0]])
+    for y, wrong in ((1300.0, 24.0), (2500.0, 44.0), (4150.0, 73.0)):
+        x, _ = two_leds(camera, pair, [spike(at) for at in optical(pair, 0.0, y, turn)])
+        assert x == pytest.approx(wrong, abs=1.0)
+        seen = WALL[camera.sees(optical(WALL, 0.0, y, turn), margin=40)]
+        fix = locate(camera, seen, [spike(at) for at in optical(seen, 0.0, y, turn)], 0.005)
+        assert math.hypot(fix.x, fix.y - y) < 1.0
+        assert fix.heading == pytest.approx(turn, abs=math.radians(0.02))
 
 
 def test_kernels_are_compiled_once_for_all_kinds_of_input() -> None:

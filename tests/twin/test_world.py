@@ -254,6 +254,42 @@ def test_images_are_seen_only_through_the_wall() -> None:
     assert slanted.image(Led(0, (100, -100, 0))).position == pytest.approx((0, 0, 0))
 
 
+def test_a_wall_hides_what_is_behind_it() -> None:
+    """A screen 1 m before the LEDs, from x = 100 on; it need not reflect."""
+    leds = [Led(0, (0, 0, 0)), Led(1, (300, 0, 50))]
+    for reflectivity in (0.0, 0.5):
+        screen = Wall((100, 1000), (900, 1000), reflectivity)
+        lit = dict(World(leds, Pose(0, 2000), walls=[screen]).lit())
+        assert sorted(lit) == [0]  # the way to LED 1 crosses y = 1000 at x = 150
+        assert sorted(dict(World(leds, Pose(-200, 2000), walls=[screen]).lit())) == [0, 1]
+    for turn in np.linspace(0, 1, 50):  # LEDs that are mounted on a wall are before it
+        cos, sin = np.cos(turn), np.sin(turn)
+        wall = Wall((-1000 * cos, -1000 * sin), (1000 * cos, 1000 * sin), 0.0)
+        for along in (-250.0, 70.0, 250.0):
+            led = Led(0, (along * cos, along * sin, 0), facing=turn)
+            assert not wall.hides(led, -2000 * sin, 2000 * cos)
+
+
+def test_a_wall_hides_reflections_too() -> None:
+    """Light that goes from the LED at x = 0 to the mirror in x = 800, and from there to y = 2000."""
+    led, mirror = Led(0, (0, 0, 0)), Wall((800, -1000), (800, 5000), 0.5)
+    tracker = Pose(0, 2000, heading=0.35)  # the mirror is met at y = 1000
+
+    def light(*screens: Wall) -> float:
+        return float(World([led], tracker, head=SLIT, walls=[mirror, *screens]).rates()[0].sum())
+
+    both = light()
+    before, after = Wall((400, 400), (400, 600), 0.0), Wall((400, 1400), (400, 1600), 0.0)
+    beyond = Wall((1200, 400), (1200, 600), 0.0)  # only the image's way to the mirror crosses it
+    direct = light(before)
+    assert 0 < direct < both
+    assert light(after) == direct
+    assert light(beyond) == both
+    straight = Wall((-50, 1000), (50, 1000), 0.0)
+    assert light(straight) == pytest.approx(both - direct)
+    assert light(straight, after) == 0
+
+
 def test_the_ghost_moves_with_the_tracker() -> None:
     walls = [Wall((350, -1000), (350, 5000), 0.3)]
     led = Led(0, (0, 0, 0), power=1.0)
@@ -314,6 +350,15 @@ def test_equal_worlds_give_equal_light() -> None:
     ("wrong", "message"),
     [
         (lambda: Led(64, (0, 0, 0)), "allowed are 0 to 63"),
+        (lambda: Led(1.5, (0, 0, 0)), "whole numbers"),  # type: ignore[arg-type]
+        (lambda: Led(True, (0, 0, 0)), "whole numbers"),
+        (lambda: Led("1", (0, 0, 0)), "whole numbers"),  # type: ignore[arg-type]
+        (lambda: Occlusion(0.0, 1.0, [1.5]), "whole numbers"),  # type: ignore[list-item]
+        (lambda: Led(0, (0, 0, 0), facing=45), "facing = 45 rad.*in degrees"),
+        (lambda: Pose(0, 0, 90), "heading = 90 rad.*in degrees"),
+        (lambda: Pose(0, 0, pitch=10), "pitch = 10 rad.*in degrees"),
+        (lambda: Pose(0, 0, roll=-10), "roll = -10 rad.*in degrees"),
+        (lambda: Mount(90), "in degrees"),
         (lambda: Led(0, (0, 0)), "x, y and z"),  # type: ignore[arg-type]
         (lambda: Led(0, (0, np.nan, 0)), "finite"),
         (lambda: Led(0, (0, 0, 0), power=-1), "power"),
