@@ -31,11 +31,11 @@ if TYPE_CHECKING:
 
 # enumerations are slow: inside, flags are whole numbers
 _FLAGS = tuple(PoseFlags(n) for n in range(2 * max(PoseFlags)))
-_PREDICTED, _LOST, _RELOCALISED, _REJECTED, _INCONSISTENT = (
+_PREDICTED, _LOST, _RELOCALISED, _REJECTED, _INCONSISTENT, _UNCHECKED = (
     int(flag)
     for flag in (
         *(PoseFlags.PREDICTED, PoseFlags.LOST, PoseFlags.RELOCALISED),
-        *(PoseFlags.REJECTED, PoseFlags.INCONSISTENT),
+        *(PoseFlags.REJECTED, PoseFlags.INCONSISTENT, PoseFlags.UNCHECKED),
     )
 )
 _UNCERTAIN = int(SpikeFlags.CLIPPED | SpikeFlags.DOUBLE)
@@ -278,9 +278,9 @@ class MotionFilter:
         self._to_confirm = 0
         self._tries = 0
         self._flags = 0
-        self._doubt = 0  # flags of a pose that too few LEDs speak for …
+        self._unchecked = False  # the pose: too few LEDs speak for it …
         self._witnesses: frozenset[int] = frozenset()  # … and these
-        self._refused: set[int] = set()  # since any spike was beyond doubt
+        self._refused: set[int] = set()  # since any spike was believed
         self.lost = True
         self.losses = 0
         self.stale = 0
@@ -302,14 +302,14 @@ class MotionFilter:
         return self._cov.copy()
 
     @property
-    def doubt(self) -> PoseFlags:
-        """Flags that `estimate` sets until a further LED agrees with the pose; 0 is none.
+    def unchecked(self) -> bool:
+        """Whether a further LED has still to agree with the pose (`PoseFlags.UNCHECKED`).
 
-        RELOCALISED: the pose was found with three LEDs, which fit some pose even if one of them is
-        a reflection. PREDICTED: after a time without, spikes of one LED alone passed, which might
-        have been anything near; or it passed after it had been refused.
+        It was found with three LEDs, which fit some pose even if one of them is a reflection; or,
+        after a time without, spikes of one LED alone passed, which might have been anything near;
+        or one passed after it had been refused.
         """
-        return _FLAGS[self._doubt]
+        return self._unchecked
 
     def start(self, fix: Fix, t_ns: int) -> None:
         """Begin at a pose; its rates are unknown.
@@ -336,7 +336,7 @@ class MotionFilter:
         )
         self._cov[:3, :3] = fix.covariance
         self._witnesses = frozenset()
-        self._lock(0)
+        self._lock(unchecked=False)
 
     def _begin(self, t_ns: int, motion: Any, covariance: NDArray[np.float64]) -> None:
         self._t = int(t_ns)
@@ -347,9 +347,9 @@ class MotionFilter:
         self._cov[:6, :6] = covariance
         self._cov[6, 6], self._cov[7, 7] = self._height.sigma**2, self._bias.sigma**2
 
-    def _lock(self, doubt: int) -> None:
+    def _lock(self, *, unchecked: bool) -> None:
         self.lost = False
-        self._doubt = doubt
+        self._unchecked = unchecked
         self._refused.clear()
         self._used_ns = self._t
         self._recent = 0
@@ -421,7 +421,7 @@ class MotionFilter:
         if outcome is Outcome.USED:
             self._used_ns = self._t
             self._believe(row, scale - variance > DOUBT**2)
-            if not self._recent and not self._doubt:
+            if not self._recent and not self._unchecked:
                 self._trusted = (self._t, *self._state[:3].tolist())
         else:
             self._recent |= 1
@@ -475,7 +475,7 @@ class MotionFilter:
         """
         state, cov, t_ns = self._at(t_ns)
         flags = self._flags
-        flags |= _LOST if self.lost else self._doubt
+        flags |= _LOST if self.lost else _UNCHECKED * self._unchecked
         if t_ns > self._used_ns:
             flags |= _PREDICTED
         if self._mean_nis > INFLATED:
@@ -609,12 +609,12 @@ class MotionFilter:
     def _believe(self, row: int, doubtful: bool) -> None:
         """Find out whether a spike that passed the gate speaks for the pose, or was easy to please."""
         if doubtful or row in self._refused:
-            if not self._doubt:
-                self._doubt, self._witnesses = _PREDICTED, frozenset([row])
+            if not self._unchecked:
+                self._unchecked, self._witnesses = True, frozenset([row])
             return
         self._refused.clear()
         if row not in self._witnesses:
-            self._doubt = 0
+            self._unchecked = False
 
     def _judge(self) -> None:
         """Find out whether lock is lost."""
@@ -649,7 +649,7 @@ class MotionFilter:
                 if scale - variance <= DOUBT**2:
                     self._witnesses |= {row}
                 if not self._to_confirm:
-                    self._lock(_RELOCALISED if len(self._witnesses) <= NEEDED else 0)
+                    self._lock(unchecked=len(self._witnesses) <= NEEDED)
                     self._flags = _RELOCALISED
             elif self._tries >= 2 * CONFIRMATIONS:
                 self._to_confirm = 0

@@ -2,9 +2,11 @@
 
 Whole numbers only, and no more passes over the pixels than a Cortex-M4 has time for:
 
-1. Light is summed over blocks of 8 pixels. Peaks and valleys of these sums must differ by ten times
-   the noise: that of the dark reference, or a 16th of the light for its own and for uneven pixels.
-   Two peaks are one spike if the valley between them is above half of the lower one.
+1. Light is summed over blocks of 8 pixels. Peaks and valleys of these sums must differ by twenty
+   times the noise in the dark, of which 13 elements tell little, and a 16th of the light for its
+   own and for uneven pixels; from its base, a spike by an eighth of that. Two peaks are one spike
+   if the valley between them is above half of the lower one. A pixel with darkness on both sides
+   is no spike.
 2. The full width at half maximum is found on the pixels; on the blocks if 8 of them or more are
    above half, or if there are two peaks: then at half of the lower one, around both.
 3. The position is where the derivative of light, smoothed by (1 − (x/r)²)² with r = 9/8 of the
@@ -19,8 +21,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from acquisition.frames import LEADING, PIXELS, Frame, OnboardSpike, SpikeFrame
-from acquisition.protocol import FULL_WINDOW, SATURATED, SPIKES_MAX, WINDOW_MIN, WINDOWS_MAX
+from acquisition.frames import LEADING, Frame, OnboardSpike, SpikeFrame
+from acquisition.protocol import FULL_WINDOW, SATURATED, SPIKES_MAX, check_windows
 from acquisition.wiring import PROTOCOL
 from tracking.spikes import SpikeFlags
 
@@ -53,9 +55,10 @@ def find_spikes(
     ----------
     frame : Frame
     windows : sequence of tuple of int, optional
-        First and last pixel of each window, 1 to 8 of them, 16 pixels or more each.
+        First and last pixel of each window, 1 to 8 of them, 24 pixels or more each. They do not
+        overlap. If there are as many as LEDs are lit, one LED is expected in each.
     saturated : int, optional
-        Code at or below which a pixel is full; 0: unknown.
+        Light with which a pixel is full, counts below the dark reference; 0: unknown.
     threshold : int, optional
         Light that a spike must have, counts over 8 pixels; 0: above the noise.
 
@@ -67,31 +70,31 @@ def find_spikes(
     Raises
     ------
     ValueError
-        There are too many windows, or one is too short or not on the line.
+        There are too many windows, two overlap, or one is too short or not on the line.
     """
-    if not 1 <= len(windows) <= WINDOWS_MAX:
-        raise ValueError(f"{len(windows)} windows: allowed are 1 to {WINDOWS_MAX}")
-    for first, last in windows:
-        if not (first >= 0 and last < PIXELS and last - first + 1 >= WINDOW_MIN):
-            raise ValueError(
-                f"window {first} to {last}: allowed are {WINDOW_MIN} pixels or more within 0 to "
-                f"{PIXELS - 1}"
-            )
+    windows = check_windows(windows)
     dark = frame.dark.tolist()
     total, count = sum(dark), len(dark)
-    changes = sum(abs(b - a) for a, b in zip(dark, dark[2:], strict=False))
-    zero = (total + count // 2) // count
-    least = threshold or max(3 * changes, _NOISE_LEAST)
+    noise = sum(abs(b - a) for a, b in zip(dark, dark[2:], strict=False))
+    about = _About(
+        zero=(total + count // 2) // count,
+        noise=noise,
+        least=threshold or max(5 * noise, _NOISE_LEAST),
+        saturated=saturated,
+        alone=0 < len(frame.channels) <= len(windows),
+    )
     elements = frame.elements.tolist()
     spikes: list[OnboardSpike] = []
     for number, (first, last) in enumerate(windows):
         pixels = elements[LEADING + first : LEADING + last + 1]
         most = SPIKES_MAX - len(spikes) - (len(windows) - 1 - number)
-        found = _Line(pixels, zero, least, saturated).spikes(most)
-        spikes += [_placed(spike, first, number) for spike in found]
+        for spike in _Line(pixels, about).spikes(most):
+            place = spike.place / _POSITION_SCALE + first
+            width = spike.width / _WIDTH_SCALE
+            spikes.append(OnboardSpike(place, width, spike.height, spike.flags, number))
     return SpikeFrame(
         tuple(spikes),
-        windows=tuple((int(first), int(last)) for first, last in windows),
+        windows=windows,
         dark_level=min((_DARK_SCALE * total + count // 2) // count, _U16_MAX) / _DARK_SCALE,
         sequence=frame.sequence,
         leds=frame.leds,
@@ -106,6 +109,16 @@ def find_spikes(
     )
 
 
+class _About(NamedTuple):
+    """What is known of the frame."""
+
+    zero: int  # code without light
+    noise: int  # of a pixel in the dark, 12 times
+    least: int
+    saturated: int
+    alone: bool  # all light in a window is of one LED
+
+
 class _Found(NamedTuple):
     """A spike in the units of the wire; its place counts from the window's first pixel."""
 
@@ -113,13 +126,6 @@ class _Found(NamedTuple):
     width: int
     height: int
     flags: int
-
-
-def _placed(spike: _Found, first: int, window: int) -> OnboardSpike:
-    place = min(spike.place + first * _POSITION_SCALE, (PIXELS - 1) * _POSITION_SCALE)
-    return OnboardSpike(
-        place / _POSITION_SCALE, spike.width / _WIDTH_SCALE, spike.height, spike.flags, window
-    )
 
 
 class _Peak(NamedTuple):
@@ -135,37 +141,54 @@ class _Peak(NamedTuple):
 class _Line:
     """A window of the line, its first pixel and block being 0."""
 
-    def __init__(self, pixels: list[int], zero: int, least: int, saturated: int) -> None:
-        self.pixels = pixels
-        self.saturated = saturated
-        self.least = least
-        self.light = [zero - pixel for pixel in pixels]
-        self.blocks = [
-            sum(self.light[n : n + _BLOCK]) for n in range(0, len(pixels) - _BLOCK + 1, _BLOCK)
-        ]
+    def __init__(self, pixels: list[int], about: _About) -> None:
+        self.about = about
+        self.light = [about.zero - pixel for pixel in pixels]
+        count = -(-len(pixels) // _BLOCK)  # the last one overlaps the one before it if it must
+        self.starts = [min(n * _BLOCK, len(pixels) - _BLOCK) for n in range(count)]
+        self.blocks = [sum(self.light[at : at + _BLOCK]) for at in self.starts]
 
     def spikes(self, most: int) -> list[_Found]:
         """Return at most so many, the highest first; of equal ones, the one found first."""
-        peaks = self._joined(self._peaks())
+        peaks = [peak for peak in self._joined(self._peaks()) if self._is_spike(peak)]
         peaks = sorted(peaks, key=self._height, reverse=True)[:most]
         spikes = sorted(map(self._refined, peaks), key=lambda spike: spike.height, reverse=True)
-        return [
-            spike._replace(flags=spike.flags | SpikeFlags.REFLECTION)
-            if any(
-                2 * other.height <= spike.height
-                and abs(other.place - spike.place) * _WIDTH_SCALE
-                <= 4 * spike.width * _POSITION_SCALE
-                for other in spikes[n + 1 :]
-            )
-            else spike
-            for n, spike in enumerate(spikes)
-        ]
+        if not (self.about.alone and spikes):
+            return spikes
+        highest, *others = spikes
+        flags = highest.flags
+        for other in others:
+            apart = abs(other.place - highest.place)
+            if apart * _WIDTH_SCALE <= 4 * highest.width * _POSITION_SCALE:
+                flags |= self._second(other.height, highest.height)
+        return [highest._replace(flags=flags), *others]
+
+    def _second(self, height: int, highest: int) -> SpikeFlags:
+        """Tell what a second peak is: if no other LED is lit, a weaker one is a reflection."""
+        weak = self.about.alone and 2 * height <= highest
+        return SpikeFlags.REFLECTION if weak else SpikeFlags.DOUBLE
+
+    def _base(self, peak: _Peak) -> int:
+        return min(self.blocks[peak.left], self.blocks[peak.right])
 
     def _height(self, peak: _Peak) -> int:
-        return self.blocks[peak.top] - min(self.blocks[peak.left], self.blocks[peak.right])
+        return self.blocks[peak.top] - self._base(peak)
+
+    def _is_spike(self, peak: _Peak) -> bool:
+        """It rises enough from its base, and not all of its light is in one pixel."""
+        base, height = self._base(peak), self._height(peak)
+        if height <= self.about.least + max(base, 0) // 8:
+            return False
+        start = self.starts[peak.top]
+        at = max(range(start, start + _BLOCK), key=self.light.__getitem__)
+        if at < 2 or at + 2 >= len(self.light):
+            return True
+        beside = sum(self.light[at + n] for n in (-2, -1, 1, 2)) - base // 2
+        lonely = 4 * (self.light[at] - base // _BLOCK) >= 3 * height
+        return not (2 * beside <= 3 * self.about.noise and lonely)
 
     def _least_rise(self, light: int) -> int:
-        return self.least + max(light, 0) // 16
+        return self.about.least + max(light, 0) // 16
 
     def _peaks(self) -> list[_Peak]:
         """Peaks and valleys in turn, each of which differs from the last by more than noise."""
@@ -224,17 +247,21 @@ class _Line:
         light = self.blocks
         begins, ends = peak.left == 0, peak.right == len(light) - 1
         first = peak.left * _BLOCK
-        last = len(self.pixels) - 1 if ends else peak.right * _BLOCK + _BLOCK - 1
+        last = self.starts[peak.right] + _BLOCK - 1
+        right_block = min(peak.right, len(self.light) // _BLOCK - 1)  # of those at even distances
+        top_block = min(peak.top, right_block)
 
-        around = 2 * self._above(peak, min(light[peak.left], light[peak.right])) + 4
+        around = 2 * self._above(peak, self._base(peak)) + 4
         near = slice(max(peak.left, peak.top - around), min(peak.right, peak.top + around) + 1)
-        base = min(light[near])
+        base = block_base = min(light[near])
         if peak.twin or self._above(peak, base) >= _WIDE:
             twice = peak.lower + base
-            left, open_left = _half_place(light, peak.top, -1, peak.left, twice)
-            right, open_right = _half_place(light, peak.top, 1, peak.right, twice)
+            left, open_left = _half_place(light, top_block, -1, peak.left, twice)
+            right, open_right = _half_place(light, top_block, 1, right_block, twice)
             left, right = _BLOCK * left + _MIDDLE, _BLOCK * right + _MIDDLE
             height = max(light[peak.top] - base, 0) // _BLOCK
+            start = self.starts[peak.top]
+            most = max(self.light[start : start + _BLOCK])
         else:
             tops = range(
                 max((peak.top - 1) * _BLOCK, first), min((peak.top + 2) * _BLOCK - 1, last) + 1
@@ -245,35 +272,39 @@ class _Line:
             left, open_left = _half_place(self.light, top, -1, max(first, top - _SEEN), twice)
             right, open_right = _half_place(self.light, top, 1, min(last, top + _SEEN), twice)
             height = max(self.light[top] - base, 0)
+            most = self.light[top]
         width = right - left
         place = (left + right) // 2
         if width >= _WIDE * _BLOCK * _FRACTION:
-            bounds = peak.left, peak.right
-            zero, cut = _derivative_zero(light, _BLOCK, place - _MIDDLE, width, *bounds)
+            bounds = peak.left, right_block
+            zero = _derivative_zero(light, _BLOCK, place - _MIDDLE, width, *bounds)
             zero = None if zero is None else _BLOCK * zero + _MIDDLE
         else:
-            zero, cut = _derivative_zero(self.light, 1, place, width, first, last)
+            zero = _derivative_zero(self.light, 1, place, width, first, last)
         place = place if zero is None else zero
 
+        end = (len(self.light) - 1) * _FRACTION
         flags = SpikeFlags.NONE
-        if peak.twin or (open_left and not begins) or (open_right and not ends):
+        if (open_left and not begins) or (open_right and not ends):
             flags |= SpikeFlags.DOUBLE
-        if (open_left and begins) or (open_right and ends) or (cut and (begins or ends)):
+        elif peak.twin:
+            flags |= self._second(peak.lower - block_base, light[peak.top] - block_base)
+        over = place < width or place + width > end
+        if (open_left and begins) or (open_right and ends) or over:
             flags |= SpikeFlags.CLIPPED
-        within = slice(max(left // _FRACTION, 0), max(right // _FRACTION + 1, 0))
-        if any(pixel <= self.saturated for pixel in self.pixels[within]):
+        if 0 < self.about.saturated <= most:
             flags |= SpikeFlags.SATURATED
         width = min(width * _WIDTH_SCALE // _FRACTION, _U16_MAX)
-        return _Found(max(place, 0), width, min(height, _U16_MAX), int(flags))
+        return _Found(min(max(place, 0), end), width, min(height, _U16_MAX), int(flags))
 
 
 def _derivative_zero(
     light: list[int], size: int, place: int, width: int, first: int, last: int
-) -> tuple[int | None, bool]:
+) -> int | None:
     """Where the derivative of smoothed light is zero near a place, in fractions of a sample.
 
-    None if too little light of this spike, from first to last, is on either side to tell; the
-    second value is then whether it ends too soon. Place and width are in fractions of a pixel.
+    None if too little light of this spike, from first to last, is on either side to tell. Place
+    and width are in fractions of a pixel.
     """
     unit = size * _FRACTION
     middle = (place + unit // 2) // unit
@@ -281,8 +312,8 @@ def _derivative_zero(
     room = min(middle - first, last - middle)
     reach = min(wanted, room, _REACH_MAX)
     if reach < 3 or 2 * reach * unit < width:
-        return None, room < wanted
-    return _crossing(light, middle, reach, first + reach, last - reach), False
+        return None
+    return _crossing(light, middle, reach, first + reach, last - reach)
 
 
 def _half_place(light: list[int], top: int, step: int, end: int, twice: int) -> tuple[int, bool]:
@@ -311,14 +342,14 @@ def _crossing(light: list[int], at: int, reach: int, first: int, last: int) -> i
 
     low = high = at
     before = after = slope(at)
-    step = 1
+    step = max(reach // 16, 1)
     if before >= 0:
         while after >= 0:
             if high == last:
                 return None
             low, before = high, after
             high = min(high + step, last)
-            step *= 2
+            step *= 4
             after = slope(high)
     else:
         while before < 0:
@@ -326,16 +357,24 @@ def _crossing(light: list[int], at: int, reach: int, first: int, last: int) -> i
                 return None
             high, after = low, before
             low = max(low - step, first)
-            step *= 2
+            step *= 4
             before = slope(low)
+    # where a straight line crosses, which is close; every third time the middle, to be sure
+    tries = 0
     while high - low > 1:
-        middle = (low + high) // 2
-        found = slope(middle)
+        tries += 1
+        crosses = (high - low) * _ratio(before, before - after) // _FRACTION
+        inner = min(max(crosses, 1), high - low - 1) if tries % 3 else (high - low) // 2
+        found = slope(low + inner)
         if found >= 0:
-            low, before = middle, found
+            low, before = low + inner, found
         else:
-            high, after = middle, found
-    whole = before - after
+            high, after = low + inner, found
+    return low * _FRACTION + _ratio(before, before - after)
+
+
+def _ratio(part: int, whole: int) -> int:
+    """In fractions, rounded."""
     shift = max(whole.bit_length() - 21, 0)  # 32 bits are enough, and the processor divides no more
-    whole, before = whole >> shift, before >> shift
-    return low * _FRACTION + (before * _FRACTION + whole // 2) // whole
+    part, whole = part >> shift, whole >> shift
+    return (part * _FRACTION + whole // 2) // whole

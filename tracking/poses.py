@@ -50,7 +50,7 @@ class PoseFlags(IntFlag):
     """Residuals are larger than the errors stated: something is wrong with the calibration."""
     HEADING_ASSUMED = 128
     """Heading was not measured but given."""
-    UNCHECKED = 512
+    UNCHECKED = 256
     """The others do not check every spike: a gross error of one could have moved the pose by more
     than `HIDDEN` σ and not have been found."""
 

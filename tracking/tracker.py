@@ -532,7 +532,8 @@ class Tracker:
             )
         # of all LEDs of the frame; the filter's own flags are those of the last one
         outcomes = {found.outcome for found in self.innovations}
-        flags |= self._filter.estimate().flags & PoseFlags.INCONSISTENT | self._fresh
+        kept = PoseFlags.INCONSISTENT | PoseFlags.UNCHECKED
+        flags |= self._filter.estimate().flags & kept | self._fresh
         self._fresh = PoseFlags.NONE
         if Outcome.REJECTED in outcomes:
             flags |= PoseFlags.REJECTED

@@ -44,7 +44,13 @@ DESIGN = "slit-4mm"
 AHEAD = 4
 """Frames that are planned at a time."""
 
-FLAGGED = int(PoseFlags.LOST | PoseFlags.PREDICTED | PoseFlags.RELOCALISED | PoseFlags.INCONSISTENT)
+FLAGGED = int(
+    PoseFlags.LOST
+    | PoseFlags.PREDICTED
+    | PoseFlags.RELOCALISED
+    | PoseFlags.INCONSISTENT
+    | PoseFlags.UNCHECKED
+)
 USELESS = int(SpikeFlags.MISSING | SpikeFlags.SATURATED)
 """Who sees one of these is warned. A pose that only says that a spike was refused is not excused."""
 

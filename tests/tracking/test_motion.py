@@ -461,7 +461,7 @@ def test_three_leds_at_rest_are_enough() -> None:
     assert np.hypot(*(motion.state[:2] - pose[:2])) < 10
 
 
-def test_three_leds_are_in_doubt_until_a_fourth_agrees() -> None:
+def test_three_leds_are_unchecked_until_a_fourth_agrees() -> None:
     """One of them a reflection: some pose fits, and is flagged; the fourth LED finds it out."""
     motion, random = MotionFilter(CAMERA, LEDS), np.random.default_rng(9)
     pose = (50.0, 2500.0, 0.02)
@@ -471,36 +471,36 @@ def test_three_leds_are_in_doubt_until_a_fourth_agrees() -> None:
     while motion.lost and n < 100:
         n += 1
         motion.observe(n * FRAME, frame(pose, random, seen[[n % 3]]))
-    assert motion.doubt == PoseFlags.RELOCALISED
+    assert motion.unchecked
     for _ in range(30):
         n += 1
         estimate = motion.observe(n * FRAME, frame(pose, random, seen[[n % 3]]))
-        assert estimate.flags & PoseFlags.RELOCALISED
+        assert estimate.flags & PoseFlags.UNCHECKED
     motion.observe((n + 1) * FRAME, frame(pose, random, further))
     estimate = motion.observe((n + 2) * FRAME, frame(pose, random, further))
-    assert not motion.doubt
+    assert not motion.unchecked
     assert estimate.flags == PoseFlags.NONE
 
 
-def test_a_lone_spike_after_darkness_is_in_doubt() -> None:
+def test_a_lone_spike_after_darkness_is_unchecked() -> None:
     motion, random = settled(frames=60)
     pose = (0.0, 2500.0, 0.0)
     rows = on_line(pixels(pose))
     for n in range(61, 73):
         motion.observe(n * FRAME, {LEDS.channels[rows[0]]: MISSING})
     assert not motion.lost
-    assert not motion.doubt
+    assert not motion.unchecked
     alone = frame(pose, random, rows[[0]])
     for n in range(73, 78):
         estimate = motion.observe(n * FRAME, alone)
         assert motion.innovations[-1].outcome is Outcome.USED
-        assert estimate.flags & PoseFlags.PREDICTED
+        assert estimate.flags & PoseFlags.UNCHECKED
     for n in range(78, 83):
         estimate = motion.observe(n * FRAME, frame(pose, random, rows[[n % len(rows)]]))
     assert estimate.flags == PoseFlags.NONE
 
 
-def test_what_was_refused_and_passes_later_is_in_doubt() -> None:
+def test_what_was_refused_and_passes_later_is_unchecked() -> None:
     """The gate widens with time: a reflection that stays where it is comes in at some time."""
     motion, random = settled(frames=60)
     rows = on_line(pixels((0.0, 2500.0, 0.0)))
@@ -515,7 +515,7 @@ def test_what_was_refused_and_passes_later_is_in_doubt() -> None:
             break
         refused = True
     assert refused
-    assert estimate.flags & PoseFlags.PREDICTED
+    assert estimate.flags & PoseFlags.UNCHECKED
 
 
 # -- edges

@@ -179,7 +179,7 @@ def test_heading_is_measured_with_three_and_more() -> None:
     steps = room.run(tracker(leds), 150)
     last = steps[-1].estimate
     assert last is not None
-    assert last.flags == PoseFlags.NONE
+    assert last.flags == PoseFlags.UNCHECKED  # three LEDs fit some pose whatever they say
     error = np.abs(room.errors(steps[80:])).max(axis=0)
     assert (error < 5 * np.sqrt(np.diag(last.covariance))).all()
     assert (error < (3, 1, 2e-3)).all()
