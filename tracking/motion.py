@@ -717,8 +717,9 @@ class MotionFilter:
                     pixels[newest],
                     np.sqrt(moved[newest]),
                     height=self._height,
+                    facings=self.leds.facings[rows[newest]],
                 )
-            except ValueError:  # no pose has the LEDs in front
+            except ValueError:  # no pose has the LEDs in front, and shining toward it
                 continue
             if not np.isfinite(fix.covariance).all() or fix.flags & PoseFlags.AMBIGUOUS:
                 continue  # too few LEDs, or too near to each other

@@ -319,8 +319,9 @@ class Tracker:
         self._finder(Frame(codes), windows=[(1900, 2000)], unlit=Frame(codes))
         camera, leds = self.calibration.camera, self.leds
         x, y = leds.positions[:, 0].mean(), leds.positions[:, 1].max() + 3000.0
-        pixels = camera.project(optical(leds.positions, x, y, 0.0, self._motion["height"].value))
-        seen = [n for n, u in zip(leds.channels, pixels, strict=True) if np.isfinite(u)]
+        points = optical(leds.positions, x, y, 0.0, self._motion["height"].value)
+        pixels = camera.project(points)
+        seen = [n for n, s in zip(leds.channels, camera.sees(points), strict=True) if s]
         motion = MotionFilter(camera, leds, **self._motion)
         plan = default_schedule(leds)
         with suppress(ValueError):  # an odd map: it may have no pose there
@@ -502,14 +503,19 @@ class Tracker:
                 for _, s in recent.values()
             ]
         )
-        fix = locate(
-            camera,
-            self.leds.positions[[self.leds.index(n) for n in recent]],
-            np.array([spike.position for _, spike in recent.values()]),
-            np.sqrt(sigmas**2 + (3 * camera.model_error) ** 2 + (smear * ages) ** 2),
-            heading=self._heading,
-            height=self._motion["height"],
-        )
+        rows = [self.leds.index(n) for n in recent]
+        try:
+            fix = locate(
+                camera,
+                self.leds.positions[rows],
+                np.array([spike.position for _, spike in recent.values()]),
+                np.sqrt(sigmas**2 + (3 * camera.model_error) ** 2 + (smear * ages) ** 2),
+                heading=self._heading,
+                height=self._motion["height"],
+                facings=self.leds.facings[rows],
+            )
+        except ValueError:  # no pose has the LEDs in front, and shining toward it
+            return
         limit = fix.degrees + 4 * math.sqrt(2 * max(fix.degrees, 0))
         if not np.isfinite(fix.covariance).all() or fix.flags & PoseFlags.AMBIGUOUS:
             return
