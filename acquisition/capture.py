@@ -22,6 +22,8 @@ from acquisition.links import Link, LinkEnded, LinkError, LinkTimeout, pause
 from acquisition.protocol import (
     ORIGINAL_SIZE,
     SIZES,
+    STREAM_SIZE,
+    BadChecksum,
     BadHeader,
     BadVersion,
     Command,
@@ -33,7 +35,7 @@ from acquisition.protocol import (
     decode_frame,
     decode_spikes,
 )
-from acquisition.wiring import PROTOCOL
+from acquisition.wiring import PROTOCOL, WIRING
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
@@ -55,6 +57,7 @@ _SILENCE: Final = (4, 20e-3, 5e-3)  # read-outs, or s; slack, s: longer, no runn
 _UNCONFIRMED: Final = 8  # frames until a command that nothing came of is sent again
 _SEQUENCES: Final = 1 << 32
 _SLICE: Final = 0.1  # s; how long an interruption may go unnoticed
+_OLD: Final = PROTOCOL.stream.magic.to_bytes(2, "little") + bytes([PROTOCOL.stream.version])
 _ZEROS: Final = {size: bytes(size) for size in SIZES}
 
 
@@ -109,7 +112,7 @@ class CaptureStatistics:
     restarts: int = 0
 
 
-def capture(link: Link, command: Command, **options: Any) -> Iterator[Frame]:
+def capture(link: Link, command: Command, **options: Any) -> Iterator[Any]:
     """Send a command and yield the frames that answer it.
 
     Parameters
@@ -122,7 +125,7 @@ def capture(link: Link, command: Command, **options: Any) -> Iterator[Frame]:
 
     Yields
     ------
-    Frame
+    Frame, or in spikes mode SpikeFrame
         In original mode every one of them, those that contradict themselves with
         `FrameFlags.INVALID`; up to 16 are held back until all have come, since one that is missed
         would change the LEDs of the others: then they are asked for again. In stream mode only
@@ -141,7 +144,7 @@ def capture(link: Link, command: Command, **options: Any) -> Iterator[Frame]:
     return _closing(frames)
 
 
-def _closing(frames: Capture) -> Iterator[Frame]:
+def _closing(frames: Capture) -> Iterator[Any]:
     with closing(frames):
         yield from frames
 
@@ -161,10 +164,11 @@ class Capture:
     timeout : float, optional
         How long the device may be silent, s. By default six read-outs and a flush, and a quarter
         of a second for the host; while a stream runs, four read-outs or 20 ms. With
-        ``await_sync``, the edge has to come within it, or the command is sent again.
+        ``await_sync``, the edge has to come within ``retries + 1`` times that.
     retries : int, optional
         How often a command is sent again before the capture fails. Counted anew after each good
-        frame. Once frames have come, one sent again does not await an edge any more.
+        frame. Once frames have come, one sent again does not await an edge any more. None is sent
+        again to a device that says that it waits for the edge.
     firmware : {"linetrack", "original"}, optional
         "original": the published one, which sends one frame more than asked for.
     master_clock : float, optional
@@ -234,6 +238,9 @@ class Capture:
         self._base: int | None = 0  # the frame that the LED sequence began with; None: unknown
         self._settled = False  # a frame has come since the device's last (re)start
         self._refusal: Refusal | None = None
+        self._denied = False  # a stream of before went on, with word of a refusal
+        self._synced = False  # the command just sent awaits an edge
+        self._waiting = False  # and the device has said that it does
         self._frames = self._original() if command.mode is Mode.ORIGINAL else self._stream()
 
     def __iter__(self) -> Self:
@@ -306,7 +313,8 @@ class Capture:
         Raises
         ------
         CommandError
-            The sequence is not possible; in spikes mode, it has more than 14 entries.
+            The sequence is not possible; in spikes mode, it has more entries than
+            `acquisition.protocol.BRIEF_TABLE_MAX`.
         ValueError
             The capture is in original mode, or the command in another one than the capture.
         """
@@ -412,6 +420,12 @@ class Capture:
 
     def _explanation(self) -> str:
         found = self.statistics
+        if self._waiting:
+            return (
+                f"no edge on the sync line within {self._attempts} times {self._timeout:.3g} s, "
+                "though the device waits for one: is what drives the line wired to "
+                f"{WIRING.pins['sync'].name}, with a common ground, and does it rise?"
+            )
         if found.corrupt > found.timeouts:
             return (
                 f"{found.corrupt} damaged transfers and no good one after the command was sent "
@@ -499,8 +513,8 @@ class Capture:
         self._pause(_BREATH)
         self._running = True
         # once frames have come, a restart does not wait for another edge, which may never come
-        sync = self._await_sync and self._number < 0
-        command = replace(command, count=self._left(), await_sync=sync)
+        self._synced, self._waiting = self._await_sync and self._number < 0, False
+        command = replace(command, count=self._left(), await_sync=self._synced)
         self._link.transfer(command.encode(ORIGINAL_SIZE))
 
     def _left(self) -> int:
@@ -525,6 +539,11 @@ class Capture:
         statistics.timeouts += not ready
         # A stream that ran until now may have a frame though the line is stuck: look, once.
         stuck = not ready and self._started and self._fruitless == 0
+        if self._waiting and not ready:
+            self._attempts += 1
+            if self._attempts > self._retries:
+                raise LinkTimeout(self._explanation())
+            stuck, self._fruitless = True, 0  # ask whether it still waits
         if not (ready or stuck) or self._fruitless >= _FRUITLESS:
             self._repeat()
             return None
@@ -538,6 +557,8 @@ class Capture:
         except (BadVersion, BadHeader) as error:
             raise LinkError(f"the device sends what this program does not know: {error}") from error
         except DecodeError as error:
+            if isinstance(error, BadChecksum) and self._refused_by_older(data):
+                return None
             statistics.corrupt += 1
             self._lost = self._doubtful = True
             if self._on_corrupt is not None:
@@ -551,6 +572,43 @@ class Capture:
             self._answered(item)
             return None
         return self._accepted(item)
+
+    def _refused_by_older(self, data: bytes) -> bool:
+        """Whether older firmware, which knows no spikes mode, refuses it in frames of stream mode.
+
+        Of such a frame only the beginning has come, but it is sent once more.
+        """
+        if self._command.mode is not Mode.SPIKES or self._started or not data.startswith(_OLD):
+            return False
+        self._pause(_QUIET)
+        try:
+            item = decode_frame(self._link.transfer(_ZEROS[STREAM_SIZE]), master_clock=self._clock)
+        except DecodeError:
+            return False
+        if isinstance(item, Status):
+            if item.refusal is Refusal.NONE:
+                return False
+            self._answered(item)
+            return True
+        return self._denied_by(item)
+
+    def _denied_by(self, frame: Frame | SpikeFrame) -> bool:
+        """Whether a stream that ran before goes on, and says that the command was refused.
+
+        As with an answer, only the second one is believed.
+        """
+        if self._started or self._pending is None or not frame.flags & FrameFlags.REFUSED:
+            return False
+        self.statistics.stale += 1
+        if self._denied:
+            raise Refused(
+                None,
+                "what it did before goes on; do firmware and host program come from the same "
+                "release?",
+            )
+        self._denied = True
+        self._repeat()
+        return True
 
     def _outgoing(self) -> bytes:
         """Return what to send while reading: the command queued, or zeros."""
@@ -572,6 +630,7 @@ class Capture:
         if self._pending is None:
             return  # it has nothing else to send
         self._confirm(0)  # sequence numbers and LED sequence begin together
+        self._waiting = self._synced
         self._started, self._settled = True, False
         self._expected = 0 if self._number < 0 else None
 
@@ -604,6 +663,9 @@ class Capture:
 
     def _accepted(self, frame: Frame | SpikeFrame) -> Frame | SpikeFrame | None:
         """Number a good frame and tell its exposures; None if it is none of this capture's."""
+        if self._denied_by(frame):
+            return None
+        self._waiting = False
         changed = bool(frame.flags & FrameFlags.CHANGED)
         if changed:
             anew = not self._started or self._pending is not None

@@ -28,9 +28,9 @@ MASTER_CLOCK: Final = WIRING.mcu.master_clock
 """The sensor's clock on the prototype, Hz."""
 CHANNELS: Final = 64
 """LED channels that a mask has bits for."""
-FULL_SCALE: Final = 4095
+FULL_SCALE: Final = PROTOCOL.full_scale
 """Largest value of the 12-bit converter."""
-DARK: Final = slice(16, 29)
+DARK: Final = slice(PROTOCOL.dark_first, PROTOCOL.dark_first + PROTOCOL.dark_count)
 """The light-shielded elements D16 to D28, the dark reference."""
 
 _DARK_LOWEST = 1024  # the sensor's dark output is 1.5 V at least, of 3.3 V
@@ -242,8 +242,9 @@ class OnboardSpike(NamedTuple):
     height : int
         Of its peak above its base, counts.
     flags : int
-        1 saturated, 2 clipped by the window or the line, 4 double, 8 a weaker one is near: as in
-        `tracking.spikes.SpikeFlags`.
+        1 saturated, 2 clipped by the window or the line, 4 double, 8 a weaker one of the same LED
+        is near: as in `tracking.spikes.SpikeFlags`. Where several LEDs may be in a window, nothing
+        is said of the same LED.
     window : int
         Which of the frame's windows it is in.
     """
@@ -266,7 +267,7 @@ class SpikeFrame(_Readout):
     windows : tuple of tuple of int
         First and last pixel of each window that was looked through.
     dark_level : float
-        Mean of the dark reference, counts, in steps of 1/16.
+        Mean of the dark reference, counts, in steps of 1/16; a `Frame` has the median.
     sequence, leds, exposures, sh_period, icg_period, master_clock
         As those of a `Frame`.
     timestamp, utc_ns, monotonic_ns, flags

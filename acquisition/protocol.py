@@ -57,8 +57,10 @@ WINDOW_MIN: Final = PROTOCOL.spikes.window_min
 """Shortest window, pixels."""
 FULL_WINDOW: Final = (0, PIXELS - 1)
 """The window that is the whole line."""
-SATURATED: Final = PROTOCOL.spikes.saturated
-"""Code at or below which a pixel counts as full, by default."""
+SATURATED: Final = 1900
+"""Light with which a pixel counts as full by default, counts below dark, as in `Correction`."""
+BRIEF_TABLE_MAX: Final = (SPIKES_SIZE - _SPIKES.table_at - 4) // _SPIKES.entry_size
+"""Largest number of entries that a running capture in spikes mode can be sent."""
 COMMAND_MAGIC: Final = bytes(PROTOCOL.command_magic)
 """What a command begins with."""
 SH_MIN: Final = PROTOCOL.sh_min
@@ -79,7 +81,7 @@ LAST_TWO: Final = WIRING.leds.last_two
 """The LED channels of the last two frames in original mode."""
 
 _U32_MAX: Final = 0xFFFF_FFFF
-_EXTENSION: Final = 16  # bytes before the table
+_EXTENSION: Final = _STREAM.table_at  # bytes before the table
 _CONTINUES: Final = _STREAM.exposure_continues
 _HEADER: Final = struct.Struct("<HBBIQQII")
 _ENTRY: Final = struct.Struct("<QI")
@@ -92,6 +94,7 @@ _SPIKE: Final = struct.Struct("<IHHBB2x")
 _NO_WINDOW: Final = (_SPIKES.no_window, _SPIKES.no_window)
 _AWAIT_SYNC: Final = PROTOCOL.options["await_sync"]
 _BRIEF: Final = PROTOCOL.options["brief"]
+_SPIKE_FLAGS: Final = sum(_SPIKES.flags.values())
 _STATUS_FLAG: Final = int(FrameFlags.STATUS)
 _KNOWN_FLAGS: Final = int(
     FrameFlags.DROPPED | FrameFlags.CHANGED | FrameFlags.REFUSED | FrameFlags.STATUS
@@ -217,12 +220,14 @@ class Command:
         original mode lights.
     windows : sequence of sequence of tuple of int, optional
         Spikes mode: where spikes are looked for in each frame of the sequence, as first and last
-        pixel, 16 pixels at least; 8 windows a frame at most. An empty one, or none given, is the
-        whole line, (0, 3647).
+        pixel, 24 pixels at least; 8 windows a frame at most, which do not overlap. An empty one,
+        or none given, is the whole line, (0, 3647).
     saturated : int, optional
-        Spikes mode: the code at or below which a pixel is full; 0 if that is unknown.
+        Spikes mode: the light with which a pixel is full, in counts below the dark reference; 0 if
+        that is unknown.
     threshold : int, optional
-        Spikes mode: how high a spike must be at least, in counts; 0: above the noise.
+        Spikes mode: the light that a spike must have at least, in counts summed over 8 pixels;
+        0: above the noise.
     await_sync : bool, optional
         Stream and spikes mode: begin with the next rising edge on the line `sync`, so that all
         microcontrollers that see it read out together. Until then no frame comes.
@@ -305,7 +310,10 @@ class Command:
                 "has its own",
                 Refusal.TABLE,
             )
-        return tuple(_checked_windows(n, of_frame) for n, of_frame in enumerate(given))
+        return tuple(
+            check_windows(of_frame, f"windows[{n}]") if len(of_frame) else (FULL_WINDOW,)
+            for n, of_frame in enumerate(given)
+        )
 
     @property
     def size(self) -> int:
@@ -430,9 +438,12 @@ class Command:
                 f"options, and {_SPIKES.version}",
                 Refusal.VERSION,
             )
-        if options & ~(_AWAIT_SYNC | _BRIEF):
+        known = _AWAIT_SYNC | (_BRIEF if mode == Mode.SPIKES else 0)
+        if options & ~known:
             raise CommandError(
-                f"options {options:#04x}: known are {_AWAIT_SYNC | _BRIEF:#04x}", Refusal.VERSION
+                f"options {options:#04x}: known are {known:#04x}, with {_BRIEF:#04x} in spikes mode "
+                "only",
+                Refusal.VERSION,
             )
         if not 1 <= entries <= TABLE_MAX:
             raise CommandError(f"{entries} entries: allowed are 1 to {TABLE_MAX}", Refusal.TABLE)
@@ -556,33 +567,59 @@ def _entries(steps: list[tuple[int, int]]) -> list[tuple[int, int]]:
     return [(mask, exposure | _CONTINUES) for mask, exposure in steps[:-1]] + steps[-1:]
 
 
-def _checked_windows(frame: int, windows: Any) -> tuple[tuple[int, int], ...]:
-    """Check the windows of one frame; without any, the whole line."""
-    result = []
+def check_windows(
+    windows: Sequence[tuple[int, int]], name: str = "windows"
+) -> tuple[tuple[int, int], ...]:
+    """Refuse windows of a frame that the device would refuse.
+
+    Parameters
+    ----------
+    windows : sequence of tuple of int
+        First and last pixel of each.
+    name : str, optional
+        What errors call them.
+
+    Returns
+    -------
+    tuple of tuple of int
+
+    Raises
+    ------
+    CommandError
+        There are none or more than 8, two overlap, or one has fewer than 24 pixels or is not on
+        the line.
+    """
+    result: list[tuple[int, int]] = []
     for window in windows:
         try:
             first, last = window
         except (TypeError, ValueError):
             raise CommandError(
-                f"windows[{frame}] = {windows!r}: pairs of first and last pixel are needed; was "
-                "one window given instead of a list of them?",
+                f"{name} = {windows!r}: pairs of first and last pixel are needed; was one window "
+                "given instead of a list of them?",
                 Refusal.TABLE,
             ) from None
-        first = _whole(f"first pixel of windows[{frame}]", first, Refusal.TABLE)
-        last = _whole(f"last pixel of windows[{frame}]", last, Refusal.TABLE)
+        first = _whole(f"first pixel of {name}", first, Refusal.TABLE)
+        last = _whole(f"last pixel of {name}", last, Refusal.TABLE)
         if not (first >= 0 and last < PIXELS and last - first + 1 >= WINDOW_MIN):
             raise CommandError(
-                f"windows[{frame}]: {first} to {last}: allowed are {WINDOW_MIN} pixels or more "
-                f"within 0 to {PIXELS - 1}",
+                f"{name}: {first} to {last}: allowed are {WINDOW_MIN} pixels or more within 0 to "
+                f"{PIXELS - 1}",
                 Refusal.TABLE,
             )
+        for other in result:
+            if first <= other[1] and other[0] <= last:
+                raise CommandError(
+                    f"{name}: {first} to {last} overlaps {other[0]} to {other[1]}: a pixel is in "
+                    "one window at most; make one of the two",
+                    Refusal.TABLE,
+                )
         result.append((first, last))
-    if len(result) > WINDOWS_MAX:
+    if not 1 <= len(result) <= WINDOWS_MAX:
         raise CommandError(
-            f"windows[{frame}]: {len(result)}: allowed are {WINDOWS_MAX} in one frame",
-            Refusal.TABLE,
+            f"{name}: {len(result)}: allowed are 1 to {WINDOWS_MAX} in one frame", Refusal.TABLE
         )
-    return tuple(result) or (FULL_WINDOW,)
+    return tuple(result)
 
 
 def _windows(table: Sequence[tuple[int, ...]]) -> list[list[tuple[int, int]]]:
@@ -768,12 +805,21 @@ def decode_spikes(
         )
     at = _HEADER.size + _FOUND.size
     windows = tuple(_WINDOW.unpack_from(data, at + n * _WINDOW.size) for n in range(window_count))
+    for first, last in windows:
+        if not first <= last < PIXELS:
+            raise BadHeader(f"window {first} to {last}: pixels are 0 to {PIXELS - 1}")
     at += WINDOWS_MAX * _WINDOW.size
     spikes = []
     for n in range(count):
         position, width, height, marks, window = _SPIKE.unpack_from(data, at + n * _SPIKE.size)
         if window >= window_count:
             raise BadHeader(f"a spike in window {window} of {window_count}")
+        if position > (PIXELS - 1) * _SPIKES.position_scale:
+            raise BadHeader(
+                f"a spike at {position / _SPIKES.position_scale:g} px: pixels are 0 to {PIXELS - 1}"
+            )
+        if marks & ~_SPIKE_FLAGS:
+            raise BadHeader(f"flags {marks:#04x} of a spike: known are {_SPIKE_FLAGS:#04x}")
         position, width = position / _SPIKES.position_scale, width / _SPIKES.width_scale
         spikes.append(OnboardSpike(position, width, height, marks, window))
     return SpikeFrame(
@@ -857,7 +903,18 @@ def encode_frame(frame: Frame) -> bytes:
 
 
 def encode_spikes(frame: SpikeFrame) -> bytes:
-    """Encode a frame as the device sends it in spikes mode, 256 bytes; see `encode_frame`."""
+    """Encode a frame as the device sends it in spikes mode, 256 bytes; see `encode_frame`.
+
+    Raises
+    ------
+    ValueError
+        It has more than 8 spikes, or not 1 to 8 windows.
+    """
+    if len(frame.spikes) > SPIKES_MAX or not 1 <= len(frame.windows) <= WINDOWS_MAX:
+        raise ValueError(
+            f"{len(frame.spikes)} spikes in {len(frame.windows)} windows: the device sends "
+            f"{SPIKES_MAX} in 1 to {WINDOWS_MAX} at most"
+        )
     spikes = [
         _SPIKE.pack(
             round(spike.position * _SPIKES.position_scale),

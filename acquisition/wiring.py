@@ -186,6 +186,7 @@ class Stream:
     magic: int
     header_size: int
     frame_size: int
+    table_at: int
     table_max: int
     entry_size: int
     exposure_min: int
@@ -211,7 +212,6 @@ class Spikes:
     position_scale: int
     width_scale: int
     dark_scale: int
-    saturated: int
     flags: Mapping[str, int]
 
 
@@ -223,6 +223,9 @@ class Protocol:
     clocks_per_element: int
     leading_elements: int
     pixels: int
+    dark_first: int
+    dark_count: int
+    full_scale: int
     command_magic: tuple[int, int]
     sh_min: int
     icg_min: int

@@ -1,8 +1,6 @@
 #include "command.h"
 
 #define MODE_AT 10u
-#define STREAM_TABLE_AT 16u
-#define FULL_SCALE 4095u
 
 static uint32_t big_endian(const uint8_t *bytes)
 {
@@ -135,7 +133,16 @@ static bool table_read(const uint8_t *bytes, uint32_t entries, struct plan *plan
     return true;
 }
 
-/* Where spikes are looked for; each frame has a window. */
+static bool overlaps(const struct window *window, const struct window *others, uint32_t count)
+{
+    for (uint32_t n = 0; n < count; n++)
+        if (window->first <= others[n].last && others[n].first <= window->last)
+            return true;
+    return false;
+}
+
+/* Where spikes are looked for. Each frame has a window, and no pixel is in two: that bounds the time
+ * it takes. */
 static bool windows_read(const uint8_t *bytes, uint32_t entries, struct plan *plan)
 {
     uint32_t windows = 0, frames = 0;
@@ -146,8 +153,11 @@ static bool windows_read(const uint8_t *bytes, uint32_t entries, struct plan *pl
         if (first != SPIKES_NO_WINDOW || last != SPIKES_NO_WINDOW) {
             if (last >= PIXELS || first + SPIKES_WINDOW_MIN > last + 1u)
                 return false;
-            plan->windows[windows++] =
-                (struct window){.first = (uint16_t)first, .last = (uint16_t)last};
+            const struct window window = {.first = (uint16_t)first, .last = (uint16_t)last};
+            const uint32_t before = plan->first_window[frames];
+            if (overlaps(&window, plan->windows + before, windows - before))
+                return false;
+            plan->windows[windows++] = window;
         }
         if (entry_read(bytes, n).continues)
             continue;
@@ -180,7 +190,7 @@ uint32_t command_read(const uint8_t *bytes, struct plan *plan)
     if (version != SPIKES_VERSION &&
         (version != STREAM_VERSION || plan->mode == MODE_SPIKES || options))
         return REFUSAL_VERSION;
-    if (options & ~(OPTION_AWAIT_SYNC | OPTION_BRIEF))
+    if (options & ~(OPTION_AWAIT_SYNC | (plan->mode == MODE_SPIKES ? OPTION_BRIEF : 0u)))
         return REFUSAL_VERSION;
     plan->await_sync = (options & OPTION_AWAIT_SYNC) != 0;
     if (entries < 1u || entries > STREAM_TABLE_MAX)

@@ -2,9 +2,10 @@
 
 #include "board.h"
 
-/* At most at once: one is sent, one waits for that, one gets its checksum or is searched, one waits
- * for that, one is filled, and with an ADC that never stops the next one is chosen. */
-#define FRAMES 6u
+/* At most at once: one is sent, one waits for that, one gets its checksum, the next is searched
+ * already, one waits for that, one is filled, and with an ADC that never stops its successor is
+ * chosen. */
+#define FRAMES 7u
 
 #define CRC_STREAM (&DMA2->stream[1])
 #define CRC_FLAGS(flags) ((flags) << 6)

@@ -24,6 +24,8 @@
 #define STRING_OF(text) #text
 #define BUILD_ID "linetrack " VERSION " " COMPILER " " SOURCES /* the latter two: see Makefile */
 #define STALL_TICKS (STREAM_STALL_US / TICK_US)
+/* A command of original length in spikes framing, in whole transfers of that. */
+#define HELD_MIN (ORIGINAL_SIZE / SPIKES_FRAME_SIZE * SPIKES_FRAME_SIZE)
 #define ORIGINAL_STALL_TICKS (STREAM_ORIGINAL_STALL_US / TICK_US)
 
 /* NUL padded; kept by the linker script, so that an image tells what it is */
@@ -347,7 +349,7 @@ void link_tick(void)
     if (!gave_up)
         return;
     /* A host that does not know of stream framing sends a command of original length. */
-    if (held || (framing == MODE_STREAM && STREAM_FRAME_SIZE - missing >= ORIGINAL_SIZE &&
+    if (held >= HELD_MIN || (framing == MODE_STREAM && STREAM_FRAME_SIZE - missing >= ORIGINAL_SIZE &&
                  command_present(head))) {
         complete();
         return;

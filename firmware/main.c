@@ -19,8 +19,15 @@ static void original_command(struct plan *plan, uint32_t refusal)
 
 static void stream_command(struct plan *plan, uint32_t refusal)
 {
-    if (refusal && sensor_streams()) {
-        sensor_mark_refusal();
+    const uint32_t running = sensor_mode();
+    /* A host that wants another mode would not understand what goes on; but with a wrong checksum
+     * the mode may be wrong as well. */
+    if (refusal && running != MODE_ORIGINAL &&
+        (refusal == REFUSAL_CHECKSUM || plan->mode == running)) {
+        if (sensor_awaits())
+            link_status(refusal);
+        else
+            sensor_mark_refusal();
         return;
     }
     if (!refusal && sensor_exchange(plan))

@@ -304,8 +304,8 @@ void DMA2_Stream0_IRQHandler(void)
 
 /* --- read-outs --------------------------------------------------------------------------------- */
 
-/* What to look for in the next read-out. */
-static void plan_search(void)
+/* What to look for in the next read-out, with these LEDs lit. */
+static void plan_search(uint64_t leds)
 {
     struct search *search = &exposed.search;
     const uint32_t first = plan->first_window[table_index];
@@ -314,6 +314,10 @@ static void plan_search(void)
     search->count = (uint8_t)(plan->first_window[table_index + 1u] - first);
     for (uint32_t n = 0; n < search->count; n++)
         search->windows[n] = plan->windows[first + n];
+    const bool dark = !leds;
+    for (uint32_t n = 0; n < search->count; n++)
+        leds &= leds - 1u;
+    search->alone = !dark && !leds; /* as many windows as LEDs: one is in each */
 }
 
 /* An exposure begins, which the next ICG edge reads out. */
@@ -328,9 +332,9 @@ static void expose(void)
         exposed.flags = FLAG_CHANGED;
     }
     if (plan->mode != MODE_ORIGINAL) {
-        if (plan->mode == MODE_SPIKES)
-            plan_search();
         exposed.leds = lights_plan(plan, table_index);
+        if (plan->mode == MODE_SPIKES)
+            plan_search(exposed.leds);
         table_index = table_index + 1u < plan->frames ? table_index + 1u : 0;
     } else if (remaining <= 2u) {
         exposed.leds = 1u << (remaining == 1u ? LED_LAST : LED_SECOND_TO_LAST);
@@ -455,6 +459,8 @@ static void await_sync(void)
  * is 37 us in a read-out. */
 void EXTI1_IRQHandler(void)
 {
+    if (!(EXTI->PR & SYNC_LINE))
+        return; /* an edge of before, when nobody waited any more */
     EXTI->PR = SYNC_LINE;
     EXTI->IMR &= ~SYNC_LINE;
     if (phase == AWAIT) {
@@ -528,13 +534,18 @@ void sensor_halt(void)
     irq_restore(masked);
 }
 
-bool sensor_streams(void)
+uint32_t sensor_mode(void)
 {
     const uint32_t masked = irq_save();
     const struct plan *last = next_plan ? next_plan : plan;
-    const bool streams = phase > AWAIT && last->mode != MODE_ORIGINAL;
+    const uint32_t mode = phase == IDLE ? MODE_ORIGINAL : last->mode;
     irq_restore(masked);
-    return streams;
+    return mode;
+}
+
+bool sensor_awaits(void)
+{
+    return phase == AWAIT;
 }
 
 void sensor_mark_refusal(void)

@@ -14,7 +14,9 @@ void sensor_acquire(struct plan *plan);
  * if none runs, or one with other periods or in another mode, or if the plan awaits an edge. */
 bool sensor_exchange(struct plan *plan);
 void sensor_halt(void);
-bool sensor_streams(void); /* not in original mode; or will, after the flush */
+/* Of the read-outs that are taken, or will be after the flush or the edge; original if none are. */
+uint32_t sensor_mode(void);
+bool sensor_awaits(void); /* an edge */
 void sensor_mark_refusal(void); /* in the next frame's header */
 void sensor_periods(uint32_t *sh_period, uint32_t *icg_period); /* the last good ones */
 void sensor_queue_frame(void); /* a frame may have become free */

@@ -1,21 +1,18 @@
-/* Cycles at 84 MHz, as the emulator counts them for clang's code (gcc's takes up to 25 % more): about
- * 60 for each block of 8 pixels, so 28,000 (0.33 ms) for the whole line and 700 for a window of 100
- * pixels, and for each spike 600 (6 px wide) to 4,000 (60 or 200 px). The whole line with eight
- * spikes takes 60,000 (0.71 ms) at most, of the 310,000 that a read-out lasts. */
+/* Cycles at 84 MHz, as the emulator counts them for clang's code: about 50 for each block of 8 pixels,
+ * so 28,000 (0.34 ms) for the whole line, and for each spike 1,500 (6 px wide) to 5,000 (60 px, or
+ * as skewed as a sawtooth). Windows do not overlap, so that the most is the whole line with eight such
+ * spikes: 69,000 (0.82 ms) of the 310,000 that a read-out lasts. */
 #include "spikes.h"
 
 #include <stdbool.h>
 
-#define DARK_FIRST 16u /* the light-shielded elements D16 to D28 */
-#define DARK_COUNT 13u
-#define BLOCK 8u       /* pixels */
+#define BLOCK 8u /* pixels */
 #define BLOCKS_MAX (PIXELS / BLOCK)
 #define WIDE 8         /* blocks at half maximum from which on they are looked at instead of pixels */
 #define NOISE_LEAST 40 /* of a block's sum; ten times that of a sensor in the dark */
 #define REACH_MAX 144  /* half the kernel's length, pixels or blocks */
 #define SEEN 288       /* pixels, from the top in which half of it is looked for */
 #define FRACTION 1024  /* of a sample, fixed point */
-#define LINE_END ((PIXELS - 1u) * SPIKES_POSITION_SCALE)
 _Static_assert(SPIKES_POSITION_SCALE == FRACTION && SPIKES_WIDTH_SCALE * 64 == FRACTION, "shifts");
 
 /* Blocks: between two valleys, the highest, or two with no deep valley between them. */
@@ -30,12 +27,15 @@ struct peak {
 static struct {
     const uint16_t *pixels;
     int32_t zero; /* code without light */
-    int32_t length, blocks;
+    int32_t length, blocks; /* the last block overlaps the one before it if it must */
+    int32_t noise;          /* of a pixel in the dark, 12 times */
     int32_t threshold;
-    uint32_t saturated;
+    int32_t saturated; /* light */
     struct peak peaks[SPIKES_SPIKES_MAX]; /* the highest first */
     uint32_t count, most;
-    int32_t light[BLOCKS_MAX]; /* of each block, counts */
+    bool alone; /* all light is of one LED */
+    int32_t light[BLOCKS_MAX];  /* of each block, counts */
+    int32_t weights[REACH_MAX]; /* of the kernel, from 1 */
 } line;
 
 static int32_t smaller(int32_t a, int32_t b)
@@ -50,31 +50,65 @@ static int32_t larger(int32_t a, int32_t b)
 
 /* --- peaks ------------------------------------------------------------------------------------- */
 
-static void sum_blocks(void)
+/* First pixel of a block. */
+static int32_t block_start(int32_t n)
 {
-    const uint16_t *pixel = line.pixels;
-    for (int32_t n = 0; n < line.blocks; n++, pixel += BLOCK) {
-        const uint32_t sum = (uint32_t)pixel[0] + pixel[1] + pixel[2] + pixel[3] + pixel[4] +
-                             pixel[5] + pixel[6] + pixel[7];
-        line.light[n] = (int32_t)BLOCK * line.zero - (int32_t)sum;
-    }
+    return smaller(n * (int32_t)BLOCK, line.length - (int32_t)BLOCK);
 }
 
-/* Ten times the noise, of which the light's own and uneven pixels are a 16th of it. */
+/* Two pixels at a time, each in half of a word: codes have 12 bits. */
+static int32_t block_light(const uint16_t *pixels)
+{
+    uint32_t pairs[BLOCK / 2u];
+    __builtin_memcpy(pairs, pixels, sizeof pairs);
+    const uint32_t sums = pairs[0] + pairs[1] + pairs[2] + pairs[3];
+    return (int32_t)BLOCK * line.zero - (int32_t)((sums & 0xFFFFu) + (sums >> 16));
+}
+
+static void sum_blocks(void)
+{
+    const uint16_t *pixels = line.pixels;
+    for (int32_t n = 0; n < line.blocks - 1; n++, pixels += BLOCK)
+        line.light[n] = block_light(pixels);
+    line.light[line.blocks - 1] = block_light(line.pixels + line.length - BLOCK);
+}
+
+/* Of the light, a 16th is for its own noise and for uneven pixels. */
 static int32_t least_rise(int32_t light)
 {
     return line.threshold + (light > 0 ? light >> 4 : 0);
 }
 
+/* All of a peak's light is in one pixel: no LED is so sharp. */
+static bool is_hot_pixel(const struct peak *peak, int32_t base)
+{
+    const uint16_t *pixels = line.pixels;
+    const int32_t start = block_start(peak->top);
+    int32_t at = start;
+    for (int32_t n = start + 1; n < start + (int32_t)BLOCK; n++)
+        if (pixels[n] < pixels[at])
+            at = n;
+    if (at < 2 || at + 2 >= line.length)
+        return false;
+    const int32_t beside = 4 * line.zero - (base >> 1) - pixels[at - 2] - pixels[at - 1] -
+                           pixels[at + 1] - pixels[at + 2];
+    return 2 * beside <= 3 * line.noise &&
+           4 * (line.zero - (base >> 3) - pixels[at]) >= 3 * peak->height;
+}
+
 static void keep(struct peak peak)
 {
     const int32_t *light = line.light;
-    peak.height = light[peak.top] - smaller(light[peak.left], light[peak.right]);
+    const int32_t base = smaller(light[peak.left], light[peak.right]);
+    peak.height = light[peak.top] - base;
     uint32_t n = line.count;
+    if ((n == line.most && line.peaks[n - 1u].height >= peak.height) ||
+        peak.height <= line.threshold + (base > 0 ? base >> 3 : 0) || is_hot_pixel(&peak, base))
+        return;
     if (n < line.most)
         line.count++;
-    else if (line.peaks[--n].height >= peak.height)
-        return;
+    else
+        n--;
     for (; n > 0 && line.peaks[n - 1u].height < peak.height; n--)
         line.peaks[n] = line.peaks[n - 1u];
     line.peaks[n] = peak;
@@ -173,28 +207,47 @@ static inline int32_t half_place(bool wide, int32_t at, int32_t step, int32_t en
     return n * FRACTION + step * ((2 * inside - twice) * (FRACTION / 2) / (inside - outside));
 }
 
-/* The derivative of light smoothed by (1 - (x/reach)^2)^2: positive left of a spike's middle. */
-static inline int64_t slope(bool wide, int32_t at, int32_t reach)
+/* Of the derivative of (1 - (x/reach)^2)^2. */
+static void weigh(int32_t reach)
 {
     const int32_t square = reach * reach;
+    for (int32_t x = 1; x < reach; x++)
+        line.weights[x] = x * (square - x * x);
+}
+
+/* The derivative of light so smoothed: positive left of a spike's middle. */
+static inline int64_t slope(bool wide, int32_t at, int32_t reach)
+{
+    const int32_t *weight = line.weights;
     int64_t sum = 0;
     if (wide) {
         const int32_t *right = line.light + at, *left = right;
         for (int32_t x = 1; x < reach; x++)
-            sum += (int64_t)(x * (square - x * x)) * (*++right - *--left);
+            sum += (int64_t)*++weight * (*++right - *--left);
     } else {
         const uint16_t *right = line.pixels + at, *left = right;
         for (int32_t x = 1; x < reach; x++)
-            sum += (int64_t)(x * (square - x * x)) * (*--left - *++right);
+            sum += (int64_t)*++weight * (*--left - *++right);
     }
     return sum;
+}
+
+/* Of two numbers, neither negative, part below whole: their ratio in fractions, rounded. */
+static int32_t ratio(int64_t part, int64_t whole)
+{
+    /* 32 bits are enough, and the processor divides by no more; slopes have 45 at most */
+    const uint32_t high = (uint32_t)(whole >> 21);
+    const uint32_t shift = high ? 32u - (uint32_t)__builtin_clz(high) : 0;
+    const uint32_t divisor = (uint32_t)(whole >> shift);
+    return (int32_t)(((uint32_t)(part >> shift) * FRACTION + divisor / 2u) / divisor);
 }
 
 /* Where the slope changes its sign, in fractions of a sample; -1 if it does not. */
 static inline int32_t crossing(bool wide, int32_t at, int32_t reach, int32_t first, int32_t last)
 {
+    weigh(reach);
     int64_t before = slope(wide, at, reach), after = before;
-    int32_t low = at, high = at, step = 1;
+    int32_t low = at, high = at, step = larger(reach >> 4, 1);
     if (before >= 0) {
         do {
             if (high == last)
@@ -202,7 +255,7 @@ static inline int32_t crossing(bool wide, int32_t at, int32_t reach, int32_t fir
             low = high;
             before = after;
             high = smaller(high + step, last);
-            step *= 2;
+            step *= 4;
             after = slope(wide, high, reach);
         } while (after >= 0);
     } else {
@@ -212,37 +265,34 @@ static inline int32_t crossing(bool wide, int32_t at, int32_t reach, int32_t fir
             high = low;
             after = before;
             low = larger(low - step, first);
-            step *= 2;
+            step *= 4;
             before = slope(wide, low, reach);
         } while (before < 0);
     }
-    while (high - low > 1) {
-        const int32_t middle = (low + high) / 2;
-        const int64_t found = slope(wide, middle, reach);
+    /* where a straight line crosses, which is close; every third time the middle, to be sure */
+    for (uint32_t n = 1; high - low > 1; n++) {
+        const int32_t line_crosses = (high - low) * ratio(before, before - after) / FRACTION;
+        const int32_t inner = smaller(larger(line_crosses, 1), high - low - 1);
+        const int32_t next = low + (n % 3u ? inner : (high - low) / 2);
+        const int64_t found = slope(wide, next, reach);
         if (found >= 0) {
-            low = middle;
+            low = next;
             before = found;
         } else {
-            high = middle;
+            high = next;
             after = found;
         }
     }
-    /* 32 bits are enough, and the processor divides by no more */
-    uint64_t part = (uint64_t)before, whole = (uint64_t)(before - after);
-    while (whole >= 1u << 21) {
-        whole >>= 1;
-        part >>= 1;
-    }
-    const uint32_t divisor = (uint32_t)whole;
-    return low * FRACTION + (int32_t)(((uint32_t)part * FRACTION + divisor / 2u) / divisor);
+    return low * FRACTION + ratio(before, before - after);
 }
 
-static bool saturated(int32_t first, int32_t last)
+/* Light of the brightest pixel of those. */
+static int32_t brightest(int32_t first, int32_t last)
 {
-    for (int32_t n = larger(first, 0); n <= last && n < line.length; n++)
-        if (line.pixels[n] <= line.saturated)
-            return true;
-    return false;
+    int32_t code = line.pixels[first];
+    for (int32_t n = first + 1; n <= last; n++)
+        code = smaller(code, line.pixels[n]);
+    return line.zero - code;
 }
 
 /* How many blocks around the top are above half, of the lower one if there are two. */
@@ -267,7 +317,7 @@ static int32_t pixel_place(bool wide, int32_t place)
 /* Where the derivative of smoothed light is zero near `place`, in fractions of a pixel; -1 if there
  * is too little light on either side to tell. Light of this peak reaches from first to last. */
 static inline int32_t derivative_zero(bool wide, int32_t place, int32_t width, int32_t first,
-                                      int32_t last, bool *cut)
+                                      int32_t last)
 {
     const int32_t bits = wide ? 13 : 10, half = 1 << (bits - 1);
     const int32_t middle = (place - pixel_place(wide, 0) + half) >> bits;
@@ -275,12 +325,16 @@ static inline int32_t derivative_zero(bool wide, int32_t place, int32_t width, i
     const int32_t wanted = larger((width + width / 8 + half) >> bits, 4);
     const int32_t room = smaller(middle - first, last - middle);
     const int32_t reach = smaller(smaller(wanted, room), REACH_MAX);
-    if (reach < 3 || 2 * reach << bits < width) {
-        *cut = room < wanted;
+    if (reach < 3 || 2 * reach << bits < width)
         return -1;
-    }
     const int32_t zero = crossing(wide, middle, reach, first + reach, last - reach);
     return zero < 0 ? -1 : pixel_place(wide, zero);
+}
+
+/* What a second peak is: if no other LED is lit, a weaker one is a reflection. */
+static uint8_t second(int32_t height, int32_t highest)
+{
+    return line.alone && 2 * height <= highest ? SPIKE_REFLECTION : SPIKE_DOUBLE;
 }
 
 static void refine(const struct peak *peak, struct spike *spike)
@@ -289,7 +343,10 @@ static void refine(const struct peak *peak, struct spike *spike)
     const int32_t block = (int32_t)BLOCK;
     const bool begins = peak->left == 0, ends = peak->right == line.blocks - 1;
     const int32_t first = peak->left * block;
-    const int32_t last = ends ? line.length - 1 : peak->right * block + block - 1;
+    const int32_t last = block_start(peak->right) + block - 1;
+    /* of blocks at even distances */
+    const int32_t right_block = smaller(peak->right, line.length / block - 1);
+    const int32_t top_block = smaller(peak->top, right_block);
 
     const int32_t around = 2 * blocks_above(peak, smaller(light[peak->left], light[peak->right])) + 4;
     int32_t base = light[peak->top];
@@ -298,14 +355,15 @@ static void refine(const struct peak *peak, struct spike *spike)
         base = smaller(base, light[n]);
 
     bool open_left = false, open_right = false;
-    int32_t left, right, height;
+    int32_t left, right, height, most; /* most: light of a pixel */
     if (peak->twin || blocks_above(peak, base) >= WIDE) {
         const int32_t twice = peak->lower + base;
-        left = half_place(true, peak->top, -1, peak->left, twice, &open_left);
-        right = half_place(true, peak->top, 1, peak->right, twice, &open_right);
+        left = half_place(true, top_block, -1, peak->left, twice, &open_left);
+        right = half_place(true, top_block, 1, right_block, twice, &open_right);
         left = pixel_place(true, left);
         right = pixel_place(true, right);
         height = (light[peak->top] - base) / block;
+        most = brightest(block_start(peak->top), block_start(peak->top) + block - 1);
     } else {
         const int32_t end = smaller(peak->top * block + 2 * block - 1, last);
         int32_t at = larger(peak->top * block - block, first);
@@ -317,25 +375,28 @@ static void refine(const struct peak *peak, struct spike *spike)
         left = half_place(false, at, -1, larger(first, at - SEEN), top + base, &open_left);
         right = half_place(false, at, 1, smaller(last, at + SEEN), top + base, &open_right);
         height = top - base;
+        most = top;
     }
     const int32_t width = right - left;
     int32_t place = (left + right) >> 1;
-    bool cut = false;
     const int32_t zero =
         width >= WIDE * block * FRACTION
-            ? derivative_zero(true, place, width, peak->left, peak->right, &cut)
-            : derivative_zero(false, place, width, first, last, &cut);
+            ? derivative_zero(true, place, width, peak->left, right_block)
+            : derivative_zero(false, place, width, first, last);
     if (zero >= 0)
         place = zero;
 
+    const int32_t end = (line.length - 1) * FRACTION;
     uint8_t flags = 0;
-    if (peak->twin || (open_left && !begins) || (open_right && !ends))
+    if ((open_left && !begins) || (open_right && !ends))
         flags |= SPIKE_DOUBLE;
-    if ((open_left && begins) || (open_right && ends) || (cut && (begins || ends)))
+    else if (peak->twin)
+        flags |= second(peak->lower - base, light[peak->top] - base);
+    if ((open_left && begins) || (open_right && ends) || place < width || place + width > end)
         flags |= SPIKE_CLIPPED;
-    if (saturated(left >> 10, right >> 10))
+    if (line.saturated && most >= line.saturated)
         flags |= SPIKE_SATURATED;
-    spike->position = (uint32_t)larger(place, 0);
+    spike->position = (uint32_t)smaller(larger(place, 0), end);
     spike->width = (uint16_t)smaller(width >> 6, UINT16_MAX);
     spike->height = (uint16_t)smaller(larger(height, 0), UINT16_MAX);
     spike->flags = flags;
@@ -346,29 +407,25 @@ static void refine(const struct peak *peak, struct spike *spike)
 static void find_in(const struct window *window, uint32_t number, struct found *found)
 {
     line.length = window->last - window->first + 1;
-    line.blocks = line.length / (int32_t)BLOCK;
+    line.blocks = (line.length + (int32_t)BLOCK - 1) / (int32_t)BLOCK;
     sum_blocks();
     find_peaks();
     struct spike *spikes = found->spikes + found->count;
     for (uint32_t n = 0; n < line.count; n++) {
         struct spike spike = {0};
         refine(&line.peaks[n], &spike);
-        const uint32_t place = spike.position + window->first * SPIKES_POSITION_SCALE;
-        spike.position = place < LINE_END ? place : LINE_END;
+        spike.position += window->first * SPIKES_POSITION_SCALE;
         spike.window = (uint8_t)number;
         uint32_t at = n;
         for (; at > 0 && spikes[at - 1u].height < spike.height; at--)
             spikes[at] = spikes[at - 1u];
         spikes[at] = spike;
     }
-    for (uint32_t n = 0; n < line.count; n++)
-        for (uint32_t other = n + 1u; other < line.count; other++) {
-            const uint32_t a = spikes[n].position, b = spikes[other].position;
-            const uint32_t apart = a > b ? a - b : b - a;
-            if (2u * spikes[other].height <= spikes[n].height &&
-                apart <= 4u * 64u * spikes[n].width)
-                spikes[n].flags |= SPIKE_REFLECTION;
-        }
+    for (uint32_t n = 1; line.alone && n < line.count; n++) {
+        const uint32_t a = spikes[0].position, b = spikes[n].position;
+        if ((a > b ? a - b : b - a) <= 4u * 64u * spikes[0].width)
+            spikes[0].flags |= second(spikes[n].height, spikes[0].height);
+    }
     found->count = (uint8_t)(found->count + line.count);
 }
 
@@ -376,11 +433,11 @@ void spikes_find(const uint16_t *elements, const struct search *search, struct f
 {
     const uint16_t *dark = elements + DARK_FIRST;
     uint32_t sum = 0;
-    int32_t changes = 0; /* 12 times the noise; between elements of the same kind, odd or even */
+    line.noise = 0; /* differences between elements of the same kind, odd or even */
     for (uint32_t n = 0; n < DARK_COUNT; n++) {
         sum += dark[n];
         if (n >= 2u)
-            changes += dark[n] > dark[n - 2u] ? dark[n] - dark[n - 2u] : dark[n - 2u] - dark[n];
+            line.noise += dark[n] > dark[n - 2u] ? dark[n] - dark[n - 2u] : dark[n - 2u] - dark[n];
     }
     const uint32_t level = (SPIKES_DARK_SCALE * sum + DARK_COUNT / 2u) / DARK_COUNT;
     found->count = 0;
@@ -389,7 +446,8 @@ void spikes_find(const uint16_t *elements, const struct search *search, struct f
     found->dark = (uint16_t)smaller((int32_t)level, UINT16_MAX);
     line.zero = (int32_t)((sum + DARK_COUNT / 2u) / DARK_COUNT);
     line.saturated = search->saturated;
-    line.threshold = search->threshold ? search->threshold : larger(3 * changes, NOISE_LEAST);
+    line.threshold = search->threshold ? search->threshold : larger(5 * line.noise, NOISE_LEAST);
+    line.alone = search->alone;
     for (uint32_t n = 0; n < search->count; n++) {
         const struct window *window = &search->windows[n];
         found->windows[n] = *window;

@@ -4,6 +4,7 @@
 #ifndef SPIKES_H
 #define SPIKES_H
 
+#include <stdbool.h>
 #include <stdint.h>
 
 #include "wiring.h"
@@ -14,9 +15,10 @@ struct window {
 
 /* What a command asks for, of one frame. */
 struct search {
-    uint16_t saturated; /* code at or below which a pixel is full; 0: unknown */
+    uint16_t saturated; /* light with which a pixel is full, counts below dark; 0: unknown */
     uint16_t threshold; /* light that a spike must have, counts over 8 pixels; 0: above the noise */
-    uint8_t count;      /* of windows */
+    uint8_t count;      /* of windows, none of which overlap */
+    bool alone;         /* light in a window is of one LED */
     struct window windows[SPIKES_WINDOWS_MAX];
 };
 

@@ -71,6 +71,7 @@ class FakeMcu:
         self.commands: list[Command] = []
         self.lit: dict[int, dict[int, int]] = {}  # by read-out
         self.level: bool | None = None  # of the handshake line, if it is stuck
+        self.edge_after: float | None = 0.0  # s, of the sync line, after a command that awaits one
         self.closed = False
         self.reset()
 
@@ -191,6 +192,8 @@ class FakeMcu:
         if self.sending is not None and self.now >= self.last_byte + STALL[self.mode]:
             held = self._held
             received, self.sending = bytes(self.received), None
+            least = ORIGINAL_SIZE // SIZES[Mode.SPIKES] * SIZES[Mode.SPIKES]
+            held &= len(received) >= least
             if held or (len(received) >= ORIGINAL_SIZE and received[:2] == b"ER"):
                 self._act(received)
             elif self.offered is None and self.mode is not Mode.ORIGINAL:
@@ -257,8 +260,12 @@ class FakeMcu:
     def _refuse(self, mode: int, refusal: Refusal) -> None:
         if mode == Mode.ORIGINAL:
             return
-        if self.mode is not Mode.ORIGINAL and self.left > 0:
-            self.flags |= FrameFlags.REFUSED
+        running = self.mode is not Mode.ORIGINAL and self.left > 0
+        if running and (mode == self.mode or refusal is Refusal.CHECKSUM):
+            if self.next_at == float("inf"):  # it awaits an edge
+                self.offered = self._answer(refusal)
+            else:
+                self.flags |= FrameFlags.REFUSED
             return
         self._stop()
         self.mode = Mode.SPIKES if mode == Mode.SPIKES else Mode.STREAM
@@ -288,6 +295,8 @@ class FakeMcu:
         self.left = command.count or float("inf")
         self.mode, self.sequence, self.table_at = command.mode, 0, 0
         self.next_at = self.now + 2 * command.icg_period / MASTER_CLOCK
+        if command.await_sync:
+            self.next_at += float("inf") if self.edge_after is None else self.edge_after
         self.offered = self._answer(Refusal.NONE)
 
     def _answer(self, refusal: Refusal) -> bytes:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 import struct
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -132,15 +133,17 @@ def commands(draw: st.DrawFn) -> Command:
     if draw(st.booleans()):
         return Command(sh, icg, count, Mode.STREAM, sequence, await_sync=sync)
     frames = len(sequence) or 2
-    windows = draw(st.lists(st.lists(a_window(), max_size=8), min_size=frames, max_size=frames))
+    windows = [draw(some_windows()) for _ in range(frames)]
     code = st.integers(0, 4095)
     return Command(*(sh, icg, count, Mode.SPIKES, sequence, windows, draw(code), draw(code), sync))
 
 
 @st.composite
-def a_window(draw: st.DrawFn) -> tuple[int, int]:
-    first = draw(st.integers(0, PIXELS - 16))
-    return first, draw(st.integers(first + 15, PIXELS - 1))
+def some_windows(draw: st.DrawFn) -> list[tuple[int, int]]:
+    """Up to eight that do not overlap, in any order."""
+    ends = draw(st.lists(st.integers(0, PIXELS), max_size=16, unique=True).map(sorted))
+    pairs = zip(ends[::2], ends[1::2], strict=False)
+    return draw(st.permutations([(a, b - 1) for a, b in pairs if b - a >= 24]))
 
 
 @settings(max_examples=300)
@@ -167,18 +170,18 @@ def test_extended_command_byte_for_byte() -> None:
 def test_command_of_spikes_mode_byte_for_byte() -> None:
     command = Command(
         *(100, 30000, 0x0102, Mode.SPIKES, [{0: 50, 63: 90}, {1: 30}]),
-        windows=[[(1, 16)], [(7, 99), (2, 200)]],
+        windows=[[(1, 24)], [(107, 199), (2, 100)]],
         threshold=0x123,
         await_sync=True,
     )
-    table = struct.pack("<QIHH", 1 << 63, 90 | 1 << 31, 1, 16)
+    table = struct.pack("<QIHH", 1 << 63, 90 | 1 << 31, 1, 24)
     table += struct.pack("<QIHH", 1, 50, 0xFFFF, 0xFFFF)
-    table += struct.pack("<QIHH", 2, 30 | 1 << 31, 7, 99) + struct.pack("<QIHH", 0, 0, 2, 200)
+    table += struct.pack("<QIHH", 2, 30 | 1 << 31, 107, 199) + struct.pack("<QIHH", 0, 0, 2, 100)
     for size, options in ((ORIGINAL_SIZE, 1), (SPIKES_SIZE, 3)):
         head = bytes.fromhex("4552 00000064 00007530 02 0102 02 04") + bytes([options])
         head += bytes.fromhex("6c07 2301") + table
         assert command.encode(size) == (head + struct.pack("<I", slow_crc(head))).ljust(size, b"\0")
-    assert command.windows == (((1, 16),), ((7, 99), (2, 200)))
+    assert command.windows == (((1, 24),), ((107, 199), (2, 100)))
     assert Command(100, 30000, 1, Mode.SPIKES, [{}]).windows == (((0, 3647),),)
 
 
@@ -192,6 +195,9 @@ def test_leds_of_a_frame() -> None:
     assert Command(100, 30000, 1).leds(0) == {1: 100}
     command = Command(100, 30000, 4, Mode.STREAM, [{7: 41}, {}])
     assert [command.leds(n) for n in range(3)] == [{7: 41}, {}, {7: 41}]
+
+
+NINE = [(100 * n, 100 * n + 99) for n in range(9)]
 
 
 @pytest.mark.parametrize(
@@ -213,14 +219,18 @@ def test_leds_of_a_frame() -> None:
         ((100, True, 2), "whole number"),
         ((100, 30000, 2, 9), "mode = 9"),
         ((100, 30000, 2, Mode.STREAM, [{}], [[(0, 99)]]), "Mode.SPIKES meant"),
-        ((100, 30000, 2, Mode.SPIKES, [{}], [[(0, 14)]]), "0 to 14: allowed are 16 pixels"),
+        ((100, 30000, 2, Mode.SPIKES, [{}], [[(0, 22)]]), "0 to 22: allowed are 24 pixels"),
+        (
+            (100, 30000, 2, Mode.SPIKES, [{}], [[(0, 99), (99, 200)]]),
+            "99 to 200 overlaps 0 to 99: a pixel is in one window",
+        ),
         ((100, 30000, 2, Mode.SPIKES, [{}], [[(0, 3648)]]), "within 0 to 3647"),
         ((100, 30000, 2, Mode.SPIKES, [{}], [[(-1, 30)]]), "within 0 to 3647"),
         ((100, 30000, 2, Mode.SPIKES, [{}], [(0, 99)]), "one window given instead of a list"),
         ((100, 30000, 2, Mode.SPIKES, [{}], [[(0.5, 99)]]), "whole number"),
-        ((100, 30000, 2, Mode.SPIKES, [{}], [[(0, 99)] * 9]), "9: allowed are 8"),
+        ((100, 30000, 2, Mode.SPIKES, [{}], [NINE]), "9: allowed are 1 to 8"),
         ((100, 30000, 2, Mode.SPIKES, [{}], [[], []]), "2 for a sequence of 1 frames"),
-        ((100, 30000, 2, Mode.SPIKES, [{}] * 9, [[(0, 99)] * 8] * 9), "72 entries.*holds 64"),
+        ((100, 30000, 2, Mode.SPIKES, [{}] * 9, [NINE[:8]] * 9), "72 entries.*holds 64"),
         ((100, 30000, 2, Mode.SPIKES, [{}], [], 4096), "saturated = 4096"),
         ((100, 30000, 2, Mode.SPIKES, [{}], [], 0, -1), "threshold = -1"),
         ((100, 30000, 2, Mode.ORIGINAL, [], [], 0, 0, True), "original mode begins at once"),
@@ -485,6 +495,10 @@ def test_spikes_byte_for_byte() -> None:
     assert SPIKES.channels == (0, 5, 63)
     with pytest.raises(ValueError, match="master_clock"):
         SpikeFrame((), master_clock=0)
+    with pytest.raises(ValueError, match="9 spikes in 2 windows"):
+        encode_spikes(replace(SPIKES, spikes=SPIKES.spikes[:1] * 9))
+    with pytest.raises(ValueError, match="2 spikes in 0 windows"):
+        encode_spikes(replace(SPIKES, windows=()))
 
 
 def test_status_in_spikes_mode() -> None:
@@ -504,6 +518,10 @@ def test_status_in_spikes_mode() -> None:
         (33, 0, BadHeader),
         (33, 9, BadHeader),
         (72 + 9, 2, BadHeader),
+        (72 + 8, 16, BadHeader),  # a flag that none knows
+        (72 + 12, 1, BadHeader),  # beyond the last pixel
+        (40 + 2 + 1, 0x0F, BadHeader),  # a window off the line
+        (40 + 4 + 1, 0x0F, BadHeader),  # one that ends before it begins
     ],
 )
 def test_intact_but_wrong_spikes(at: int, value: int, error: type[DecodeError]) -> None:

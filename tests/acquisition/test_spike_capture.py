@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import islice
 from typing import TYPE_CHECKING
 
@@ -10,7 +11,7 @@ import pytest
 
 from acquisition.capture import Capture, Refused, SpikeCapture, capture
 from acquisition.frames import Frame, FrameFlags, SpikeFrame
-from acquisition.links import LinkError, ReplayLink
+from acquisition.links import LinkError, LinkTimeout, ReplayLink
 from acquisition.protocol import FULL_WINDOW, Command, CommandError, Mode, Refusal
 from acquisition.session import SessionError, SessionWriter
 from tests.acquisition.fake_mcu import BREAKS, FakeMcu, FaultyWire, elements_at, spikes_at
@@ -65,7 +66,8 @@ def test_an_endless_capture_is_stopped_and_one_in_any_mode_follows(then: Mode) -
 def test_a_running_capture_of_somebody_else_is_taken_over(then: Mode) -> None:
     """Its transfers have another length than the command's, which the new host cannot know."""
     link = FakeMcu()
-    check(islice(SpikeCapture(link, spikes()), 5))
+    before = SpikeCapture(link, spikes())
+    check(islice(before, 5))
     following = Capture(link, Command(200, 24000, 4, then))
     found = list(following)
     assert [frame.sequence for frame in found] == list(range(4))
@@ -154,10 +156,84 @@ def test_older_firmware_refuses() -> None:
     class Older(FakeMcu):
         def _act(self, received: bytes) -> None:
             if received[:2] == b"ER" and received[10]:
-                self._refuse(received[10], Refusal.VERSION)
+                self._refuse(Mode.STREAM, Refusal.VERSION)
 
+    link = Older()
     with pytest.raises(Refused, match=r"version.*same release"):
-        list(capture(Older(), spikes(3)))
+        list(capture(link, spikes(3)))
+    assert link.mode is Mode.STREAM
+    # it does the same while a stream of somebody else goes on, but says less
+    link._start(Command(100, 20000, 0, Mode.STREAM))
+    with pytest.raises(Refused, match=r"goes on.*same release"):
+        list(capture(link, spikes(3)))
+
+
+@pytest.mark.parametrize("mode", [Mode.STREAM, Mode.SPIKES])
+def test_refused_while_a_stream_of_somebody_else_goes_on(mode: Mode) -> None:
+    class Picky(FakeMcu):
+        def _act(self, received: bytes) -> None:
+            if received[:2] == b"ER" and self.commands:
+                self._refuse(received[10], Refusal.TABLE)
+            else:
+                super()._act(received)
+
+    for running in (Mode.STREAM, Mode.SPIKES):
+        link = Picky()
+        before = Capture(link, Command(100, 20000, 0, running))
+        assert len(list(islice(before, 3))) == 3
+        why = "goes on" if mode is running else "table"
+        with pytest.raises(Refused, match=why):
+            list(capture(link, Command(100, 20000, 3, mode)))
+
+
+@pytest.mark.parametrize("mode", [Mode.STREAM, Mode.SPIKES])
+def test_a_command_that_awaits_an_edge_is_sent_once(mode: Mode) -> None:
+    command = Command(100, 20000, 3, mode, await_sync=True)
+    link = FakeMcu()
+    link.edge_after = 0.8
+    frames = Capture(link, command, timeout=0.3)
+    assert len(list(frames)) == 3
+    assert frames.statistics.restarts == 0
+    assert len(link.commands) == 1
+    # without an edge the line is named, and nothing stays armed
+    link.edge_after = None
+    with (
+        pytest.raises(LinkTimeout, match=r"sync line.*PB1"),
+        Capture(link, replace(command, count=0), timeout=0.3) as frames,
+    ):
+        next(frames)
+    assert link.commands[-1].count == 1
+    assert not link.commands[-1].await_sync
+
+
+def test_a_device_that_was_reset_while_it_waited_is_told_again() -> None:
+    class Unsteady(FakeMcu):
+        def wait_ready(self, timeout: float) -> bool:
+            if len(self.commands) == 1 and self.now > 0.1:
+                self.reset()
+            return super().wait_ready(timeout)
+
+    link = Unsteady()
+    link.edge_after = 0.5
+    command = Command(100, 20000, 3, Mode.SPIKES, await_sync=True)
+    frames = Capture(link, command, timeout=0.3, retries=5)
+    assert len(list(frames)) == 3
+    assert frames.statistics.restarts == 1
+    assert [command.await_sync for command in link.commands] == [True, True]
+
+
+def test_a_damaged_command_does_not_end_the_wait() -> None:
+    link = FakeMcu()
+    link.edge_after = None
+    command = Command(100, 20000, 3, Mode.SPIKES, await_sync=True)
+    link.exchange(command.encode())
+    link.sleep(0.01)
+    link.exchange(bytes(256))
+    damaged = bytearray(command.encode(256))
+    damaged[20] ^= 1
+    link.exchange(bytes(damaged))
+    assert link.ready
+    assert link.left == 3
 
 
 def test_recordings_have_pixels(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from acquisition.protocol import Command, CommandError, Mode, Refusal, crc32_words
 from acquisition.wiring import PROTOCOL, WIRING, sh_edge
+from tests.acquisition.test_protocol import some_windows
 from tests.firmware.builds import FIRMWARE
 
 if TYPE_CHECKING:
@@ -116,12 +117,6 @@ def periods(draw: st.DrawFn) -> tuple[int, int]:
 
 
 @st.composite
-def a_window(draw: st.DrawFn) -> tuple[int, int]:
-    first = draw(st.integers(0, 3648 - 16))
-    return first, draw(st.integers(first + 15, 3647))
-
-
-@st.composite
 def commands(draw: st.DrawFn) -> Command:
     sh, icg = draw(periods())
     longest = min(sh, 0x7FFFFFFF)
@@ -132,8 +127,7 @@ def commands(draw: st.DrawFn) -> Command:
     options: dict[str, Any] = {}
     if mode is Mode.SPIKES:
         code = st.integers(0, 4095)
-        places = st.lists(a_window(), max_size=8)
-        options["windows"] = draw(st.lists(places, min_size=len(sequence), max_size=len(sequence)))
+        options["windows"] = [draw(some_windows()) for _ in sequence]
         options.update(saturated=draw(code), threshold=draw(code))
     try:
         return Command(sh, icg, count, mode, sequence, await_sync=sync, **options)
@@ -254,20 +248,32 @@ NONE = (0xFFFF, 0xFFFF)
         (raw_command(entry(1, 100), options=1), Refusal.VERSION),
         (raw_command(entry(1, 100), version=2, options=1), Refusal.NONE),
         (raw_command(entry(1, 100), version=2, options=4), Refusal.VERSION),
+        (raw_command(entry(1, 100), version=2, options=2), Refusal.VERSION),
         (raw_command(entry(1, 100), version=3), Refusal.VERSION),
         (windowed((1, 100, 0, 3647)), Refusal.NONE),
-        (windowed((1, 100, 0, 15)), Refusal.NONE),
-        (windowed((1, 100, 3632, 3647)), Refusal.NONE),
-        (windowed((1, 100, 0, 14)), Refusal.TABLE),
+        (windowed((1, 100, 0, 23)), Refusal.NONE),
+        (windowed((1, 100, 3624, 3647)), Refusal.NONE),
+        (windowed((1, 100, 0, 22)), Refusal.TABLE),
         (windowed((1, 100, 20, 5)), Refusal.TABLE),
         (windowed((1, 100, 0, 3648)), Refusal.TABLE),
         (windowed((1, 100, 0xFFFF, 3647)), Refusal.TABLE),
         (windowed((1, 100, *NONE)), Refusal.TABLE),
         (windowed((1, 100 | MORE, *NONE), (2, 50, 0, 99)), Refusal.NONE),
-        (windowed((1, 100 | MORE, 7, 99), (0, MORE, 0, 99), (0, 0, 50, 99)), Refusal.NONE),
-        (windowed((1, 100 | MORE, 7, 99), (0, MORE, 0, 99), (1, 50, 50, 99)), Refusal.TABLE),
-        (windowed(*[(0, MORE, 0, 99)] * 7, (0, 0, 0, 99)), Refusal.NONE),
-        (windowed(*[(0, MORE, 0, 99)] * 8, (0, 0, 0, 99)), Refusal.TABLE),
+        (windowed((1, 100 | MORE, 90, 120), (0, MORE, 0, 89), (0, 0, 121, 3647)), Refusal.NONE),
+        (windowed((1, 100 | MORE, 90, 120), (0, MORE, 0, 90), (0, 0, 121, 3647)), Refusal.TABLE),
+        (windowed((1, 100 | MORE, 90, 120), (0, 0, 120, 160)), Refusal.TABLE),
+        (windowed((1, 100 | MORE, 90, 120), (0, 0, 0, 3647)), Refusal.TABLE),
+        (windowed((1, 100 | MORE, 0, 3647), (0, 0, 90, 120)), Refusal.TABLE),
+        (windowed((1, 100, 90, 120), (1, 100, 100, 130)), Refusal.NONE),
+        (windowed((1, 100 | MORE, 7, 99), (0, MORE, 200, 299), (1, 50, 350, 399)), Refusal.TABLE),
+        (
+            windowed(*[(0, MORE, n, n + 23) for n in range(24, 192, 24)], (0, 0, 0, 23)),
+            Refusal.NONE,
+        ),
+        (
+            windowed(*[(0, MORE, n, n + 23) for n in range(24, 216, 24)], (0, 0, 0, 23)),
+            Refusal.TABLE,
+        ),
         (windowed((1, 101, 0, 99)), Refusal.TABLE),
         (windowed((1, 100, 0, 99), limits=(4095, 4095)), Refusal.NONE),
         (windowed((1, 100, 0, 99), limits=(4096, 0)), Refusal.TABLE),
@@ -323,7 +329,8 @@ def test_anything(library: Any, data: bytes, sealed: bool, mode: int) -> None:
         assert all(0 < s.tick < plan.icg_period for steps in frames(plan) for s in steps)
         for of_frame in windows(plan) if mode == 2 else ():
             assert 1 <= len(of_frame) <= 8
-            assert all(a + 15 <= b <= 3647 for a, b in of_frame)
+            assert all(a + 23 <= b <= 3647 for a, b in of_frame)
+            assert all(a[1] < b[0] for a, b in itertools.pairwise(sorted(of_frame)))
 
 
 def test_short_transfers(library: Any) -> None:

@@ -279,7 +279,7 @@ def _source(link: FaultyLink, frame: SpikeFrame) -> bytes:
     place = [sum(1 << n for n in lit) for lit in SPIKES.sequence].index(frame.leds)
     for key, (_, leds, codes) in reversed(link.readouts.items()):
         if leds == frame.leds and frame.windows == SPIKES.windows[place]:
-            expected = find_spikes(Frame(codes), frame.windows)
+            expected = find_spikes(Frame(codes, leds=leds), frame.windows)
             if (expected.spikes, expected.dark_level) == (frame.spikes, frame.dark_level):
                 return key if frame.spikes else b""
     return b""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
+from contextlib import nullcontext
 from itertools import islice, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,7 +17,7 @@ from acquisition.capture import Capture, SpikeCapture, capture
 from acquisition.frames import FrameFlags
 from acquisition.protocol import Command, Mode
 from twin.link import IMAGE, TwinLink
-from twin.machine import TimingViolation
+from twin.machine import MachineError, TimingViolation
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -24,15 +25,19 @@ if TYPE_CHECKING:
 FIRMWARE = Path(__file__).parents[2] / "firmware"
 NUMBERED = np.arange(3695, dtype=np.uint16)
 CALL = Command(200, 30000, 1)
+SLOWLY = (
+    "    for (volatile uint32_t n = 0; n < 70000u; n++) {\n    }\n    spikes_find(frame->elements"
+)
 
 
 @pytest.fixture
 def variant(tmp_path: Path) -> Callable[[str, str, str], Path]:
-    """Compile the firmware with one text replaced in one file."""
+    """Compile the firmware with one text replaced in one file, and what was replaced before."""
 
     def build(file: str, text: str, replacement: str) -> Path:
         folder = tmp_path / "firmware"
-        shutil.copytree(FIRMWARE, folder, ignore=shutil.ignore_patterns("build*"))
+        if not folder.exists():
+            shutil.copytree(FIRMWARE, folder, ignore=shutil.ignore_patterns("build*"))
         shutil.copy(FIRMWARE.parent / "pyproject.toml", tmp_path)
         source = (folder / file).read_text()
         assert source.count(text) == 1, text
@@ -47,7 +52,7 @@ def variant(tmp_path: Path) -> Callable[[str, str, str], Path]:
 def elements(image: Path, command: Command = CALL) -> np.ndarray[tuple[int], np.dtype[np.uint16]]:
     with TwinLink(image=image) as link:
         link.machine._digitise_python = lambda _charge, _time: NUMBERED
-        return next(capture(link, command)).elements
+        return next(Capture(link, command)).elements
 
 
 def test_a_slow_adc_skips_elements(variant: Callable[[str, str, str], Path]) -> None:
@@ -118,9 +123,7 @@ def test_a_slow_search_for_spikes_costs_frames_and_nothing_else(
     variant: Callable[[str, str, str], Path], icg: int
 ) -> None:
     """What is read out meanwhile waits, the newest one; buffers suffice all the same."""
-    search = "    spikes_find(frame->elements"
-    slow = "    for (volatile uint32_t n = 0; n < 70000u; n++) {\n    }\n" + search
-    image = variant("frames.c", search, slow)
+    image = variant("frames.c", "    spikes_find(frame->elements", SLOWLY)
     command = Command(200, icg, 0, Mode.SPIKES, [{0: 200}, {1: 200}])
     with TwinLink(image=image) as link, SpikeCapture(link, command) as frames:
         found = list(islice(frames, 40))
@@ -144,6 +147,48 @@ def test_a_slow_search_for_spikes_costs_frames_and_nothing_else(
             with Capture(link, Command(200, icg, count, mode)) as mixed:
                 assert len(list(islice(mixed, 2))) == 2
                 assert mixed.statistics.corrupt == mixed.statistics.invalid == 0
+
+
+@pytest.mark.parametrize("enough", [True, False])
+def test_as_many_buffers_as_can_be_in_use_at_once(
+    variant: Callable[[str, str, str], Path], enough: bool
+) -> None:
+    """One frame gets its checksum while the next is searched, and another is read out meanwhile."""
+    variant("frames.c", "    spikes_find(frame->elements", SLOWLY)
+    # the end of a checksum is noticed late, but everything else goes on
+    image = variant(
+        "frames.c", "irq_enable(IRQ_DMA2_STREAM1, PRIORITY_ADC);",
+        "irq_enable(IRQ_DMA2_STREAM1, PRIORITY_TICK);",
+    )  # fmt: skip
+    noticed = "    DMA2->LIFCR = CRC_FLAGS(DMA_ISR_ALL);\n    struct frame *frame = sealing"
+    wait = "    for (volatile uint32_t n = 0; n < 30000u; n++) {\n    }\n"
+    image = variant("frames.c", noticed, wait + noticed)
+    if not enough:
+        image = variant("frames.c", "#define FRAMES 7u", "#define FRAMES 6u")
+    with (
+        nullcontext() if enough else pytest.raises(MachineError, match="HardFault"),
+        TwinLink(image=image) as link,
+    ):
+        frames = SpikeCapture(link, Command(200, 14800, 0, Mode.SPIKES))
+        for _ in range(6):
+            assert len(list(islice(frames, 3))) == 3
+            link.sleep(0.15)  # a host that does not read: one frame offered, one queued
+        assert frames.statistics.corrupt == 0
+
+
+def test_an_edge_of_before_does_not_end_the_wait(variant: Callable[[str, str, str], Path]) -> None:
+    """An interrupt may be pending though its cause has been cleared."""
+    waits = "    phase = AWAIT;\n"
+    pending = "    *(volatile uint32_t *)0xE000E200 = 1u << IRQ_EXTI1;\n"
+    image = variant("sensor.c", waits, waits + pending)
+    with TwinLink(image=image) as link:
+        link.sleep(1e-3)
+        link.transfer(Command(200, 20000, 3, Mode.SPIKES, await_sync=True).encode())
+        assert link.wait_ready(0.1)
+        link.transfer(bytes(256))
+        assert not link.wait_ready(0.2)
+        link.machine.drive("PB1", True)
+        assert link.wait_ready(0.2)
 
 
 def test_an_led_that_is_never_lit_is_not_seen(variant: Callable[[str, str, str], Path]) -> None:
