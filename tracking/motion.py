@@ -21,7 +21,7 @@ from tracking.poses import Estimate, Fix, PoseFlags, Prior, locate
 from tracking.spikes import SpikeFlags
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
     from numpy.typing import NDArray
 
@@ -311,13 +311,15 @@ class MotionFilter:
         """
         return self._unchecked
 
-    def start(self, fix: Fix, t_ns: int) -> None:
+    def start(self, fix: Fix, t_ns: int, channels: Iterable[int] = ()) -> None:
         """Begin at a pose; its rates are unknown.
 
         Parameters
         ----------
         fix : Fix
         t_ns : int
+        channels : iterable of int
+            Of the LEDs that it is from: if it is `PoseFlags.UNCHECKED`, it is until another agrees.
 
         Raises
         ------
@@ -335,8 +337,8 @@ class MotionFilter:
             np.diag([0.0] * 3 + [speed**2, speed**2, turning**2]),
         )
         self._cov[:3, :3] = fix.covariance
-        self._witnesses = frozenset()
-        self._lock(unchecked=False)
+        self._witnesses = frozenset(self._rows[channel] for channel in channels)
+        self._lock(unchecked=bool(fix.flags & PoseFlags.UNCHECKED))
 
     def _begin(self, t_ns: int, motion: Any, covariance: NDArray[np.float64]) -> None:
         self._t = int(t_ns)

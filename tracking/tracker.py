@@ -24,7 +24,7 @@ import numpy as np
 
 from acquisition.capture import Capture
 from acquisition.frames import ELEMENTS, MASTER_CLOCK, Frame, FrameFlags
-from acquisition.protocol import ICG_MIN, WINDOW_MIN, Command, Mode
+from acquisition.protocol import BRIEF_TABLE_MAX, ICG_MIN, WINDOW_MIN, Command, Mode
 from raytransfer import TCD1304
 from tracking.motion import MEMORY_NS, Innovation, MotionFilter, Outcome
 from tracking.poses import Estimate, PoseFlags, Prior, locate, optical
@@ -63,7 +63,6 @@ UNLIT_EVERY: Final = 20
 END: Final = 60.0
 """Pixels at the ends of the line where part of a spike's light may be beyond it."""
 
-_ENTRIES = 14  # of the table that a running capture in spikes mode can change
 _SPEED = 1000.0  # mm/s; what is not known better
 _TURNING = 1.5  # rad/s
 _STROLL = 300.0  # mm/s; while two LEDs are seen one after the other
@@ -281,7 +280,7 @@ class Tracker:
         if self._left > 0:
             return None
         self._told.clear()
-        frames = self._left = min(AHEAD, max(1, _ENTRIES // self.schedule.per_frame))
+        frames = self._left = min(AHEAD, max(1, BRIEF_TABLE_MAX // self.schedule.per_frame))
         unlit: list[dict[int, int]] = []
         if self._unlit_every and not spikes and self._since_unlit >= self._unlit_every:
             unlit, frames = [{}], max(frames - 1, 1)
@@ -294,7 +293,8 @@ class Tracker:
         Returns
         -------
         list of list of tuple of int
-            For each frame first and last pixels; an empty list is the whole line.
+            For each frame first and last pixels, by rising pixels and apart from each other; an
+            empty list is the whole line.
         """
         if self._filter.lost:
             return [[] for _ in sequence]
@@ -306,8 +306,13 @@ class Tracker:
             times = (start + number * period, start + (number + len(sequence)) * period)
             found = [self._lit_windows(lit, self._filter.expected(t)) for t in times]
             both = [(*found[0][n], *found[1][n]) for n in found[0] if n in found[1]]
-            pairs = [(min(w), max(w)) for w in both]
-            result.append([w for w in pairs if w[1] - w[0] >= WINDOW_MIN])
+            apart: list[tuple[int, int]] = []
+            for first, last in sorted((min(w), max(w)) for w in both):
+                if apart and first <= apart[-1][1]:  # what is found there is told apart by place
+                    apart[-1] = (apart[-1][0], max(apart[-1][1], last))
+                else:
+                    apart.append((first, last))
+            result.append([w for w in apart if w[1] - w[0] + 1 >= WINDOW_MIN])
         return result
 
     def _warm(self) -> None:
@@ -521,8 +526,10 @@ class Tracker:
             return
         if fix.degrees > 0 and fix.chi2 > limit:
             return
-        self._filter.start(fix, t_ns)
-        self._fresh = fix.flags
+        self._filter.start(fix, t_ns, recent)
+        self._fresh = (
+            fix.flags & ~PoseFlags.UNCHECKED
+        )  # which the filter keeps, as long as it is so
 
     def _estimate(self, t_ns: int, *, lost: bool) -> Estimate | None:
         """The pose at the end of a frame, in which lock was lost at its beginning or not."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from itertools import islice
+from itertools import islice, pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from scipy.stats import chi2  # type: ignore[import-untyped]
 from acquisition.capture import Capture
 from acquisition.frames import ELEMENTS, LEADING, PIXELS, Frame, FrameFlags, SpikeFrame
 from acquisition.links import ReplayLink
-from acquisition.protocol import Mode
+from acquisition.protocol import Command, Mode
 from raytransfer.designs import DESIGNS
 from tracking.calibration import Calibration
 from tracking.camera import Camera
@@ -142,7 +142,7 @@ def test_two_leds_with_known_heading() -> None:
     assert all(s.estimate for s in steps[2:])
     last = steps[-1].estimate
     assert last is not None
-    assert last.flags == PoseFlags.HEADING_ASSUMED
+    assert last.flags == PoseFlags.HEADING_ASSUMED | PoseFlags.UNCHECKED  # one by the other
     assert last.heading == 0
     assert last.covariance[2, 2] == 0
     error = room.errors(steps[20:])
@@ -518,3 +518,19 @@ def test_a_walk_through_the_firmware(
     found = [i.outcome for s in lit for i in s.innovations]
     assert len(found) > 2.5 * len(lit)
     assert np.mean([outcome is Outcome.USED for outcome in found]) > 0.95
+
+
+def test_windows_of_a_frame_do_not_overlap() -> None:
+    """The device refuses such; LEDs may pass each other between now and when they are lit."""
+    room = Room(NINE, circle)
+    follower = tracker(NINE)
+    room.run(follower, 200)
+    merged = 0
+    for first in range(len(NINE) - 1):
+        lit = [dict.fromkeys(NINE.channels[first : first + 2 + first % 3], 40)] * 4
+        for windows in follower.windows(lit):
+            assert windows == sorted(windows)
+            assert all(a[1] < b[0] for a, b in pairwise(windows))
+            merged += 0 < len(windows) < len(lit[0])
+            Command(100, 14800, 0, Mode.SPIKES, [lit[0]], [windows or [(0, 3647)]])
+    assert merged
