@@ -40,7 +40,8 @@ def test_timestamps_are_the_worlds_times_to_the_cycle() -> None:
                     assert np.flatnonzero(lit[end]).tolist() == sorted(frame.exposures)
             seen.append(offset)
         steps = np.diff(seen) * CLOCK
-        assert ((steps >= 0) & (steps <= CYCLES + 1e-6)).all(), steps
+        # halt, flush and first exposure each set the timers' periods anew
+        assert ((steps >= 0) & (steps <= 3 * CYCLES + 1e-6)).all(), steps
 
 
 def test_the_clock_offset_holds_in_the_middle_of_a_capture() -> None:
