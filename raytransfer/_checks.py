@@ -54,6 +54,16 @@ def not_negative(name: str, value: Any, hint: str = "") -> float:
     return result
 
 
+def angle(name: str, value: Any) -> float:
+    """Return value as a float; refuse what is more than one turn."""
+    turned = number(name, value, "rad")
+    if abs(turned) > math.tau:
+        raise ValueError(
+            f"{name} = {turned:g} rad: allowed are −2π to 2π; was it given in degrees?"
+        )
+    return turned
+
+
 def whole(name: str, value: Any) -> int:
     """Return the value as an integer, 1 or above, or refuse it."""
     if isinstance(value, bool) or not isinstance(value, Real):

@@ -251,9 +251,8 @@ class Observation:
                 raise ValueError(
                     f"σ of {name} = {spread}: allowed is 0 (known) to infinity (unknown)"
                 )
-        value, spread = self.heading
-        if abs(value) > 2 * math.pi:
-            raise ValueError(f"heading = {value:g} rad: allowed is -2π to 2π; were degrees given?")
+        spread = self.heading.sigma
+        check.angle("heading", self.heading.value)
         if 2 * math.pi < spread < math.inf:
             raise ValueError(
                 f"σ of heading = {spread:g} rad: allowed is up to 2π, or infinity (unknown); were "

@@ -224,7 +224,7 @@ def closed_form(
     spread = np.ones(len(m)) if sigma is None else check.positive_array("sigma", sigma)
     if spread.shape != m.shape:
         raise ValueError(f"sigma has shape {m.shape}, one per tangent, not {spread.shape}")
-    pose = np.array([0.0, 0.0, 0.0 if heading is None else _angle("heading", heading)])
+    pose = np.array([0.0, 0.0, 0.0 if heading is None else check.angle("heading", heading)])
     kernels, known = load_kernels(), heading is not None
     x, y, weight = places[:, 0].copy(), places[:, 1].copy(), 1 / spread
     for _ in range(2):
@@ -267,7 +267,7 @@ def two_leds(
     places, spikes = _positions(leds), _spikes(check.array("pixels", pixels), 2)
     if len(places) != 2:
         raise ValueError(f"leds has shape (2, 3), not {places.shape}; for more there is locate")
-    turned = _angle("heading", heading)
+    turned = check.angle("heading", heading)
     x, y, _ = closed_form(camera.tangent(spikes), places[:, :2], heading=turned)
     return x + camera.pupil * math.sin(turned), y - camera.pupil * math.cos(turned)
 
@@ -348,7 +348,7 @@ def locate(
     _spikes(u[seen], int(seen.sum()))
     check_extent(leds[seen])
     heading, height = _prior("heading", heading), _prior("height", height)
-    _angle("heading.value", heading.value)
+    check.angle("heading.value", heading.value)
     if math.pi < heading.sigma < math.inf:
         raise ValueError(
             f"heading.sigma = {heading.sigma:g} rad: allowed are 0 to π, and infinity if nothing is "
@@ -358,7 +358,11 @@ def locate(
         if len(start) != 3:
             raise ValueError(f"start is x, y and heading, not {len(start)} numbers")
         x, y, turned = start
-        start = check.number("start[0]", x), check.number("start[1]", y), _angle("start[2]", turned)
+        start = (
+            check.number("start[0]", x),
+            check.number("start[1]", y),
+            check.angle("start[2]", turned),
+        )
     normals = np.zeros((len(leds), 2))
     if facings is not None:
         shines = check_facings(facings, len(leds))
@@ -829,13 +833,6 @@ def _prior(name: str, prior: Prior) -> Prior:
     if not sigma >= 0:
         raise ValueError(f"{name}.sigma = {sigma}: allowed is 0 (known) to infinity (unknown)")
     return Prior(value, sigma)
-
-
-def _angle(name: str, value: float) -> float:
-    angle = check.number(name, value)
-    if abs(angle) > math.tau:
-        raise ValueError(f"{name} = {angle:g} rad: allowed are −2π to 2π; was it given in degrees?")
-    return angle
 
 
 def _sharpness(sigma: float) -> float:

@@ -27,7 +27,6 @@ from tracking.poses import (
     REFUSED,
     ROUNDING,
     PoseFlags,
-    _angle,
     _limit,
 )
 
@@ -58,7 +57,7 @@ class MountedCamera:
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        _angle("roll of the mount", self.roll)
+        check.angle("roll of the mount", self.roll)
         if len(self.offset) != 3:
             raise ValueError(f"offset = {self.offset}: right, up and backward in mm are needed")
         for value in self.offset:
@@ -94,7 +93,7 @@ class SpacePose:
         for name in ("x", "y", "z"):
             check.number(name, getattr(self, name), "mm")
         for name in ("heading", "pitch", "roll"):
-            _angle(name, getattr(self, name))
+            check.angle(name, getattr(self, name))
 
 
 @dataclass(frozen=True)

@@ -31,11 +31,6 @@ CLOSEST = 20.0  # mm from the first vertex: nearer ones are not seen
 _ON_WALL = 1e-9  # of a way: where it begins
 
 
-def _angle(name: str, value: float) -> None:
-    if abs(check.number(name, value, "rad")) > math.tau:
-        raise ValueError(f"{name} = {value:g} rad: allowed are −2π to 2π; was it given in degrees?")
-
-
 @dataclass(frozen=True)
 class Led:
     """A Lambertian LED on one of the firmware's channels.
@@ -74,7 +69,7 @@ class Led:
         check.positive("wavelength", self.wavelength, "µm")
         if self.wavelength > 20:
             raise ValueError(f"wavelength = {self.wavelength:g} µm: was it given in nm?")
-        _angle("facing", self.facing)
+        check.angle("facing", self.facing)
         check.not_negative("extent", self.extent, "a diameter in mm")
 
     def intensity(self, x: float, y: float, z: float) -> float:
@@ -128,7 +123,7 @@ class Pose:
         for name in ("x", "y", "z"):
             check.number(name, getattr(self, name), "mm")
         for name in ("heading", "pitch", "roll"):
-            _angle(name, getattr(self, name))
+            check.angle(name, getattr(self, name))
 
     @property
     def rotation(self) -> NDArray[np.float64]:
@@ -167,7 +162,7 @@ class Mount:
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        _angle("roll of the mount", self.roll)
+        check.angle("roll of the mount", self.roll)
         if len(self.offset) != 3:
             raise ValueError(f"offset = {self.offset}: right, up and backward in mm are needed")
         for value in self.offset:
