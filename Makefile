@@ -56,6 +56,8 @@ run: setup
 	@echo "the chart as a picture: build/output.png"
 	$(BIN)/python -m twin.experiments --output build
 
+# matrices are small: BLAS's threads cost more than they bring
+test: export OPENBLAS_NUM_THREADS = 1
 test: setup lint
 	$(BIN)/python -m pytest
 

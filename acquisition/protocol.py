@@ -745,25 +745,11 @@ def decode_frame(
         `ShortFrame`, `BadMagic` or `BadChecksum`: it did not arrive as it was sent.
         `BadVersion` or `BadHeader`: it did, but is not understood here.
     """
-    header = _checked_header(data, Mode.STREAM)
-    flags, sequence, leds, clocks, icg_period, sh_period = header
-    timestamp = _nanoseconds(clocks, master_clock)
-    if flags & _STATUS_FLAG:
-        return _status(data, header, timestamp)
+    told = _told(data, Mode.STREAM, exposures, master_clock, utc_ns, monotonic_ns)
+    if isinstance(told, Status):
+        return told
     elements = np.frombuffer(data, "<u2", ELEMENTS, _HEADER.size).astype(np.uint16)
-    return Frame(
-        elements,
-        sequence=sequence,
-        leds=leds,
-        exposures={} if exposures is None else exposures,
-        sh_period=sh_period,
-        icg_period=icg_period,
-        master_clock=master_clock,
-        timestamp=timestamp,
-        utc_ns=utc_ns,
-        monotonic_ns=monotonic_ns,
-        flags=flags,
-    )
+    return Frame(elements, **told)
 
 
 def decode_spikes(
@@ -792,11 +778,9 @@ def decode_spikes(
     DecodeError
         As in `decode_frame`.
     """
-    header = _checked_header(data, Mode.SPIKES)
-    flags, sequence, leds, clocks, icg_period, sh_period = header
-    timestamp = _nanoseconds(clocks, master_clock)
-    if flags & _STATUS_FLAG:
-        return _status(data, header, timestamp)
+    told = _told(data, Mode.SPIKES, exposures, master_clock, utc_ns, monotonic_ns)
+    if isinstance(told, Status):
+        return told
     count, window_count, dark, _ = _FOUND.unpack_from(data, _HEADER.size)
     if count > SPIKES_MAX or not 1 <= window_count <= WINDOWS_MAX:
         raise BadHeader(
@@ -822,34 +806,38 @@ def decode_spikes(
             raise BadHeader(f"flags {marks:#04x} of a spike: known are {_SPIKE_FLAGS:#04x}")
         position, width = position / _SPIKES.position_scale, width / _SPIKES.width_scale
         spikes.append(OnboardSpike(position, width, height, marks, window))
-    return SpikeFrame(
-        tuple(spikes),
-        windows=windows,
-        dark_level=dark / _SPIKES.dark_scale,
-        sequence=sequence,
-        leds=leds,
-        exposures={} if exposures is None else exposures,
-        sh_period=sh_period,
-        icg_period=icg_period,
-        master_clock=master_clock,
-        timestamp=timestamp,
-        utc_ns=utc_ns,
-        monotonic_ns=monotonic_ns,
-        flags=flags,
-    )
+    return SpikeFrame(tuple(spikes), windows=windows, dark_level=dark / _SPIKES.dark_scale, **told)
 
 
-def _status(
+def _told(
     data: bytes | bytearray | memoryview,
-    header: tuple[FrameFlags, int, int, int, int, int],
-    timestamp: int,
-) -> Status:
-    flags, sequence, _, _, icg_period, sh_period = header
-    code, _, build = _STATUS.unpack_from(data, _HEADER.size)
-    if code not in Refusal._value2member_map_:
-        raise BadHeader(f"refusal {code}: known are {[member.value for member in Refusal]}")
-    firmware = build.rstrip(b"\0").decode("ascii", "replace")
-    return Status(Refusal(code), firmware, sh_period, icg_period, timestamp, sequence, flags)
+    mode: Mode,
+    exposures: Mapping[int, int] | None,
+    master_clock: int,
+    utc_ns: int,
+    monotonic_ns: int,
+) -> Status | dict[str, Any]:
+    """Return what the header and the host tell of a frame, by field; or a status as it is."""
+    flags, sequence, leds, clocks, icg_period, sh_period = _checked_header(data, mode)
+    timestamp = _nanoseconds(clocks, master_clock)
+    if flags & _STATUS_FLAG:
+        code, _, build = _STATUS.unpack_from(data, _HEADER.size)
+        if code not in Refusal._value2member_map_:
+            raise BadHeader(f"refusal {code}: known are {[member.value for member in Refusal]}")
+        firmware = build.rstrip(b"\0").decode("ascii", "replace")
+        return Status(Refusal(code), firmware, sh_period, icg_period, timestamp, sequence, flags)
+    return {
+        "sequence": sequence,
+        "leds": leds,
+        "exposures": {} if exposures is None else exposures,
+        "sh_period": sh_period,
+        "icg_period": icg_period,
+        "master_clock": master_clock,
+        "timestamp": timestamp,
+        "utc_ns": utc_ns,
+        "monotonic_ns": monotonic_ns,
+        "flags": flags,
+    }
 
 
 def _checked_header(

@@ -30,17 +30,19 @@ FRAMES = 300
 ROUNDS = 9
 STARTS = 5
 WIDTHS = (6.0, 20.0)  # px; full width at half maximum
+WINDOW = 128  # px
 FULL = 1880 * 47.0  # electrons that fill a pixel
 
 
 def run() -> list[Result]:
     """Time all parts in turns."""
     likelihood, gravity = (_finding(name) for name in ("likelihood", "gravity"))
+    windowed = _finding("gravity", WINDOW)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "frames"
         path.write_bytes(pickle.dumps(_walk(FRAMES)))
-        found, centred, filtered, tracked = interleaved(
-            ROUNDS, likelihood, gravity, _filtering(), lambda: _tracking(path)
+        found, centred, within, filtered, tracked = interleaved(
+            ROUNDS, likelihood, gravity, windowed, _filtering(), lambda: _tracking(path)
         )
         ready, longest = zip(*(_fresh(path) for _ in range(STARTS + 1)), strict=True)
     return [
@@ -55,6 +57,13 @@ def run() -> list[Result]:
             "frame → spike, centre of gravity, whole line",
             "µs",
             [1e6 * s for s in centred],
+            "lower",
+            30,
+        ),
+        Result(
+            "frame → spike, centre of gravity, window of 128 px",
+            "µs",
+            [1e6 * s for s in within],
             "lower",
             30,
         ),
@@ -85,22 +94,26 @@ def _frame(spikes: list[tuple[float, float]], width: float, **values: Any) -> Fr
     return Frame(codes, sh_period=100, icg_period=ICG, **values)
 
 
-def _finding(name: Detector) -> Callable[[], float]:
-    """Return what times a detector on spikes of `WIDTHS`."""
+def _finding(name: Detector, window: int | None = None) -> Callable[[], float]:
+    """Return what times a detector on spikes of `WIDTHS`, of the whole line or of a window."""
     from tracking.spikes import SpikeFinder
 
     finder = SpikeFinder(detector=name, limit=1)
     finder.load_kernels()
+    places = [700.3 + 211.7 * n for n in range(10)]
     frames = [
-        _frame([(700.3 + 211.7 * n, 0.7 * FULL)], width, sequence=n)
-        for n in range(10)
+        (
+            _frame([(at, 0.7 * FULL)], width, sequence=n),
+            None if window is None else [(int(at) - window // 2, int(at) + window // 2 - 1)],
+        )
+        for n, at in enumerate(places)
         for width in WIDTHS
     ]
-    for frame in frames:
-        (spike,) = finder(frame)
-        if abs(spike.position - (700.3 + 211.7 * frame.sequence)) > 0.5:
+    for frame, windows in frames:
+        (spike,) = finder(frame, windows=windows)
+        if abs(spike.position - places[frame.sequence]) > 0.5:
             raise ValueError(f"{name} finds {spike}")
-    call = seconds(lambda: [finder(frame) for frame in frames], 5)
+    call = seconds(lambda: [finder(frame, windows=windows) for frame, windows in frames], 5)
     return lambda: call() / len(frames)
 
 

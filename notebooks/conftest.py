@@ -171,6 +171,7 @@ class StrictNotebook(IPyNbFile):  # type: ignore[misc]
         self._profile = tempfile.mkdtemp(prefix="ipython-")
         with pytest.MonkeyPatch.context() as patch:
             patch.setenv("IPYTHONDIR", self._profile)
+            patch.setenv("OPENBLAS_NUM_THREADS", "1")  # as execute.py does
             super().setup()
         self.kernel.execute_cell_input = partial(
             self.kernel.kc.execute, store_history=True, stop_on_error=False

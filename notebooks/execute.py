@@ -37,7 +37,9 @@ def executed(path: Path) -> str:
         resources={"metadata": {"path": str(path.parent)}},
     )
     with tempfile.TemporaryDirectory(prefix="ipython-") as profile:
-        client.execute(env={**os.environ, "IPYTHONDIR": profile})  # not the user's own
+        # not the user's own profile; on several threads sums are rounded otherwise
+        environment = {"IPYTHONDIR": profile, "OPENBLAS_NUM_THREADS": "1"}
+        client.execute(env={**os.environ, **environment})
     for number, cell in enumerate(notebook.cells, start=1):
         cell.id = f"cell-{number:02d}"
         cell.metadata = {key: value for key, value in cell.metadata.items() if key == "tags"}

@@ -245,6 +245,42 @@ def disc(
     ]
 
 
+def disc_image(diameter: float, *, chords: bool = False) -> NDArray[np.float64]:
+    """Shares of a disc's light by part of the line, its image lying on the middle of a part.
+
+    Light of a point, convolved with it, is that of a disc.
+
+    Parameters
+    ----------
+    diameter : float
+        Of the image, in parts: pixels, or fractions of them; 0 is a point.
+    chords : bool
+        Each part gets as much as the chord in its middle tells, instead of all that falls on it:
+        the same where parts are fine.
+
+    Returns
+    -------
+    ndarray
+        An odd number of shares, 1 in all.
+
+    Raises
+    ------
+    ValueError
+        If the diameter is negative or not finite.
+    """
+    radius = check.not_negative("diameter", diameter, "in parts of the line") / 2
+    if radius < 5e-7:
+        return np.ones(1)
+    if chords:
+        across = np.arange(-math.floor(radius), math.floor(radius) + 1)
+        chord = np.sqrt(radius**2 - across**2)
+        return np.asarray(chord / chord.sum())
+    reach = math.ceil(radius - 0.5)
+    edges = np.clip((np.arange(2 * reach + 2) - reach - 0.5) / radius, -1, 1)
+    # what is under a chord's length has a closed form
+    return np.asarray(np.diff(edges * np.sqrt(1 - edges**2) + np.arcsin(edges)) / math.pi)
+
+
 def _illuminate(
     system: OpticalSystem,
     position: tuple[float, float, float],

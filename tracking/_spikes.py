@@ -22,6 +22,7 @@ MINIMUM, GRAVITY, DERIVATIVE, LIKELIHOOD = range(4)
 
 POSITION, SIGMA, WIDTH, HEIGHT, FLAGS, COLUMNS = range(6)
 
+BLOCK = 16  # places looked at together; most have nothing
 BIN = 4  # px; even, so that a difference between odd and even pixels cancels
 SCALES = 7  # widths of the search: 4 to 256 px
 NOISIER = 1.15  # times what is stated
@@ -62,8 +63,7 @@ def convert(elements, pattern, gain, inverse, settings, electrons, variance, ful
     `gain` is in electrons a code, `inverse` is one over the relative response; `settings` has
     variance without light, saturation in codes, squared relative uncertainty.
     """
-    dark = np.sort(elements[16:29])
-    reference = float(dark[6])
+    reference = float(_smallest(elements[16:29].copy(), 6))
     read, saturation, doubt = settings[0], settings[1], settings[2]
     codes = elements[32 : 32 + electrons.size]
     for i in range(electrons.size):
@@ -109,79 +109,162 @@ def _heal(electrons, variance):
 
 
 @_compile
-def _noise(total, spread, first, bins, limit):
-    """How many times larger the noise is than stated, from differences of neighbouring bins."""
-    step = max(bins // limit, 2)
-    count = (bins - 1) // step
-    if count < 16:
-        return 1.0
-    sizes = np.empty(count)
-    large = 0
-    for k in range(count):
-        a = first + k * step * BIN
-        b, c = a + BIN, a + 2 * BIN
-        difference = (total[c] - total[b]) - (total[b] - total[a])
-        sizes[k] = abs(difference) / math.sqrt(spread[c] - spread[a])
-        large += 1.4826 * sizes[k] > NOISIER
-    if 2 * large <= count:
-        return 1.0
-    sizes.sort()
-    return 1.4826 * sizes[count // 2]
-
-
-@_compile
-def _scan(total, spread, first, bins, wander, scores):
-    """Significance of light at places and scales over what is beside it, squared with its sign.
-
-    `total` and `spread` are running sums of electrons and variance. Row n of `scores` is for a
-    width of BIN 2^n pixels, in steps of `_step(n)` bins. `wander` is the variance of what does not
-    average over pixels.
-    """
-    light, noise = np.empty(bins + 1), np.empty(bins + 1)
+def _bin(total, spread, first, bins, light, noise):
+    """Of running sums of electrons and variance, those at the borders of bins."""
     for k in range(bins + 1):
         light[k] = total[first + k * BIN]
         noise[k] = spread[first + k * BIN]
+
+
+@_compile
+def _noise(light, noise, bins):
+    """How many times larger the noise is than stated, from differences of neighbouring bins."""
+    sizes = np.empty(bins)
+    count = 0
+    for limit in (100, 450):  # a median of a hundred scatters by a tenth: look again
+        step = max(bins // limit, 2)
+        count = (bins - 1) // step
+        if count < 16:
+            return 1.0
+        large = 0
+        for k in range(count):
+            a = k * step
+            difference = (light[a + 2] - light[a + 1]) - (light[a + 1] - light[a])
+            sizes[k] = abs(difference) / math.sqrt(noise[a + 2] - noise[a])
+            large += 1.4826 * sizes[k] > NOISIER
+        if 2 * large <= count:
+            return 1.0
+    return 1.4826 * _smallest(sizes[:count], count // 2)
+
+
+@_compile
+def _smallest(values, n):
+    """The value that sorting would put at place n; the values change places."""
+    low, high = 0, values.size - 1
+    while low < high:
+        pivot = values[(low + high) // 2]
+        i, j = low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while values[j] > pivot:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        if n <= j:
+            high = j
+        elif n >= i:
+            low = i
+        else:
+            break
+    return values[n]
+
+
+@_compile
+def _mark(light, noise, wide, near, floor, least, marked):
+    """In which blocks of places, with room on both sides, light may be significant.
+
+    Nearly all have none: no branches and no divisions, so that the compiler makes vectors of it.
+    """
+    far = near + wide
+    l2, l3, l4 = light[wide:], light[far:], light[far + wide :]
+    l5, l6 = light[far + wide + near :], light[far + wide + far :]
+    n2, n3, n4 = noise[wide:], noise[far:], noise[far + wide :]
+    n5, n6 = noise[far + wide + near :], noise[far + wide + far :]
+    for block in range(marked.size):
+        count = 0
+        for n in range(BLOCK):
+            k = block * BLOCK + n
+            centre = l4[k] - l3[k]
+            excess = centre - 0.5 * (l2[k] - light[k] + l6[k] - l5[k])
+            own = n4[k] - n3[k] + floor
+            around = own + 0.25 * (n2[k] - noise[k] + n6[k] - n5[k])
+            count += (
+                (excess > 0.0)
+                & (centre > 0.0)
+                & (excess * excess > least * around)
+                & (centre * centre > least * own)
+            )
+        marked[block] = count
+
+
+@_compile
+def _significance(light, noise, bins, j, wide, near, floor):
+    """Significance of light in `wide` bins from j on over what is beside it, squared with its sign.
+
+    What is beside it may be cut off or missing on one side.
+    """
+    far = near + wide
+    centre = light[j + wide] - light[j]
+    own = noise[j + wide] - noise[j] + floor
+    if j >= far and j + wide + far <= bins:
+        beside = light[j - near] - light[j - far] + light[j + wide + far] - light[j + wide + near]
+        around = noise[j - near] - noise[j - far] + noise[j + wide + far] - noise[j + wide + near]
+        excess = centre - 0.5 * beside
+        around = own + 0.25 * around
+    else:
+        around = own
+        beside, sides = 0.0, 0
+        for side in range(2):
+            a = max(j - far, 0) if side == 0 else j + wide + near
+            b = j - near if side == 0 else min(j + wide + far, bins)
+            if 2 * (b - a) >= wide:
+                part = wide / (b - a)
+                beside += (light[b] - light[a]) * part
+                around += (noise[b] - noise[a]) * part * part
+                sides += 1
+        if not sides:
+            return -1.0
+        excess = centre - beside / sides
+    # beside what is darker than dark, as of an inverted output, nothing is light
+    return min(excess * abs(excess) / around, centre * abs(centre) / own)
+
+
+@_compile
+def _scan(light, noise, bins, wander, least, scores, scales, places):
+    """Find where light stands out from what is beside it, at several scales; returns how often.
+
+    `light` and `noise` are running sums of electrons and variance over bins, with room for one more
+    block. Of scale n, the width is BIN 2^n pixels and places are in steps of `_step(n)` bins.
+    `scores` gets their significance, squared, which is more than `least`; scales ascend, and places
+    of one scale. `wander` is the variance of what does not average over pixels.
+    """
+    coarse, rough = np.zeros(bins // 2 + 1 + BLOCK), np.zeros(bins // 2 + 1 + BLOCK)
+    marked = np.empty(bins // BLOCK + 1, np.int64)
+    found = 0
     for n in range(_scales(bins)):
         wide, step, count = 1 << n, _step(n), _places(bins, n)
         near = (wide + 1) // 2
         far = near + wide
         floor = wander * (wide * BIN) ** 2
-        # both sides inside: no branches, so that the compiler makes vectors of it
+        # between these both sides are inside
         start = min((far + step - 1) // step, count)
         stop = max((bins - wide - far) // step + 1, start)
-        for k in range(start, stop):
-            j = k * step
-            centre = light[j + wide] - light[j]
-            beside = (
-                light[j - near] - light[j - far] + light[j + wide + far] - light[j + wide + near]
-            )
-            around = (
-                noise[j - near] - noise[j - far] + noise[j + wide + far] - noise[j + wide + near]
-            )
-            excess = centre - 0.5 * beside
-            own = noise[j + wide] - noise[j] + floor
-            around = own + 0.25 * around
-            # beside what is darker than dark, as of an inverted output, nothing is light
-            scores[n, k] = min(excess * abs(excess) / around, centre * abs(centre) / own)
-        for k in range(count):
-            if start <= k < stop:
+        blocks = marked[: (stop - start + BLOCK - 1) // BLOCK]
+        below = least * (1.0 - 1e-9)  # however it is rounded
+        if step == 1:
+            _mark(light, noise, wide, near, floor, below, blocks)
+        else:
+            for k in range(bins // step + 1):
+                coarse[k], rough[k] = light[k * step], noise[k * step]
+            _mark(coarse, rough, wide // step, near // step, floor, below, blocks)
+        for block in range(-1, blocks.size + 1):
+            begin = start + block * BLOCK
+            end = min(begin + BLOCK, stop)
+            if block < 0:
+                begin, end = 0, start
+            elif block == blocks.size:
+                begin, end = stop, count
+            elif not blocks[block]:
                 continue
-            j = k * step
-            centre = light[j + wide] - light[j]
-            own = noise[j + wide] - noise[j] + floor
-            around = own
-            beside, sides = 0.0, 0
-            for side in range(2):
-                a = max(j - far, 0) if side == 0 else j + wide + near
-                b = j - near if side == 0 else min(j + wide + far, bins)
-                if 2 * (b - a) >= wide:
-                    part = wide / (b - a)
-                    beside += (light[b] - light[a]) * part
-                    around += (noise[b] - noise[a]) * part * part
-                    sides += 1
-            excess = centre - beside / max(sides, 1)
-            score = min(excess * abs(excess) / around, centre * abs(centre) / own)
-            scores[n, k] = score if sides else -1.0
+            for k in range(begin, end):
+                score = _significance(light, noise, bins, k * step, wide, near, floor)
+                if score > least:
+                    scores[found], scales[found], places[found] = score, n, k
+                    found += 1
+    return found
 
 
 @_compile
@@ -938,28 +1021,34 @@ def _within(electrons, first, last, base, place):
 
 
 @_compile
-def _search(electrons, variance, full, total, spread, first, last, limit, kind, settings, out):
+def _search(
+    electrons, variance, full, total, light, noise, first, last, limit, kind, settings, out
+):  # fmt: skip
     """Find the spikes between two pixels, the most significant first; returns how many."""
     threshold, fraction = settings[3], settings[4]
     bins = (last - first + 1) // BIN
     if bins < 3:
         return 0
-    # one scale in each row
-    scores = np.empty((SCALES, bins))
-    _scan(total, spread, first, bins, WANDER * WANDER * settings[0], scores)
-    scales = _scales(bins)
+    most_places = 0
+    for n in range(_scales(bins)):
+        most_places += _places(bins, n)
+    scores = np.empty(most_places)
+    scales, places = np.empty(most_places, np.int64), np.empty(most_places, np.int64)
+    wander = WANDER * WANDER * settings[0]
+    least = threshold * threshold
+    count = _scan(light, noise, bins, wander, least, scores, scales, places)
     most = limit + 2  # what is not asked for may be too near to what is
     shapes = np.empty((most, 4))
     ends = np.empty(most, np.int64)
     found = 0
     for _ in range(4 * most):
-        top, n_top, k_top = threshold * threshold, -1, -1
-        for n in range(scales):
-            for k in range(_places(bins, n)):
-                if scores[n, k] > top:
-                    top, n_top, k_top = scores[n, k], n, k
-        if n_top < 0:
+        top, best = least, -1
+        for m in range(count):
+            if scores[m] > top:
+                top, best = scores[m], m
+        if best < 0:
             break
+        n_top, k_top = scales[best], places[best]
         scale = BIN << n_top
         centre = first + k_top * _step(n_top) * BIN + 0.5 * (scale - 1)
         shape = shapes[found]
@@ -972,19 +1061,16 @@ def _search(electrons, variance, full, total, spread, first, last, limit, kind, 
         if what:
             ends[found] = what
             found += 1
-        low, high = centre - 0.5 * scale, centre + 0.5 * scale
-        if what:
-            low, high = shape[2] - 2.0, shape[3] + 2.0
-        for n in range(scales):
-            size, step = (1 << n) * BIN, _step(n) * BIN
-            a = max(int((low - first - size) / step), 0)
-            b = min(int((high - first) / step) + 1, _places(bins, n) - 1)
-            if not what:  # only what is like it
-                if n != n_top:
-                    continue
-                a, b = max(k_top - 1, 0), min(k_top + 1, b)
-            for k in range(a, b + 1):
-                scores[n, k] = -1.0
+            low, high = shape[2] - 2.0 - first, shape[3] + 2.0 - first
+            for m in range(count):
+                size, step = BIN << scales[m], _step(scales[m]) * BIN
+                k = places[m]
+                if max(int((low - size) / step), 0) <= k <= int(high / step) + 1:
+                    scores[m] = -1.0
+        else:  # only what is like it
+            for m in range(max(best - 1, 0), min(best + 2, count)):
+                if scales[m] == n_top and abs(places[m] - k_top) <= 1:
+                    scores[m] = -1.0
         if found == most:
             break
     beside = np.zeros(2)
@@ -1097,21 +1183,25 @@ def find(
     for i in range(size):
         total[i + 1] = total[i] + electrons[i]
         spread[i + 1] = spread[i] + variance[i]
-    noise = _noise(total, spread, 0, size // BIN, 100)
-    if noise > 1.0:  # a median of a hundred scatters by a tenth: look again
-        noise = _noise(total, spread, 0, size // BIN, 450)
-    if noise > 1.0:
+    bins = size // BIN
+    light, noise = np.zeros(bins + 1 + BLOCK), np.zeros(bins + 1 + BLOCK)
+    _bin(total, spread, 0, bins, light, noise)
+    factor = _noise(light, noise, bins)
+    if factor > 1.0:
         for i in range(size):
-            variance[i] *= noise * noise
-            spread[i + 1] *= noise * noise
+            variance[i] *= factor * factor
+            spread[i + 1] *= factor * factor
+        _bin(total, spread, 0, bins, light, noise)
     most = 3 if windows.shape[0] else limit
     rows = np.empty((most, COLUMNS))
     for n in range(max(windows.shape[0], 1)):
         first, last = 0, size - 1
         if windows.shape[0]:
             first, last = max(windows[n, 0], 0), min(windows[n, 1], size - 1)
+            bins = max((last - first + 1) // BIN, 0)
+            _bin(total, spread, first, bins, light, noise)
         count = _search(
-            electrons, variance, full, total, spread, first, last, most, kind, settings, rows
+            electrons, variance, full, total, light, noise, first, last, most, kind, settings, rows
         )
         if windows.shape[0] == 0:
             out[:count] = rows[:count]

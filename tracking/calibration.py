@@ -24,7 +24,8 @@ from raytransfer.designs import Design
 from raytransfer.sensors import TCD1304
 from tracking.camera import Camera
 from tracking.leds import LedMap
-from tracking.poses import UNKNOWN, Prior, closed_form, optical, pose_jacobian
+from tracking.nominal import nominal_camera
+from tracking.poses import UNKNOWN, Prior, by_pose, closed_form, optical
 from tracking.spikes import Correction
 
 if TYPE_CHECKING:
@@ -345,14 +346,16 @@ class Calibration:
         leds : LedMap
         correction : Correction, optional
         **options
-            As for `Camera.from_system`.
+            As for `Camera.from_system`; without any, the camera of one of `DESIGNS` is there at once.
         """
-        if isinstance(head, Design):
-            options = {"sensor": head.sensor, **options}
-            head = head.system
-        camera = Camera.from_system(head, **options)
+        design = head if isinstance(head, Design) else Design(head)
+        if options:
+            camera = Camera.from_system(design.system, **{"sensor": design.sensor, **options})
+        else:
+            camera = nominal_camera(design)
         notes = (
-            f"Nominal: {head.name}, traced as drawn; no head is as drawn, and nothing was measured."
+            f"Nominal: {design.system.name}, traced as drawn; no head is as drawn, and nothing was "
+            "measured."
         )
         return cls(camera, leds, correction, notes=notes)
 
@@ -411,33 +414,37 @@ class Calibration:
         ValueError
             If nothing was measured, or the LEDs do not tell a pose.
         """
+        led = np.array([self.leds.index(channel) for channel in channels], dtype=int)
+        rows = _Rows(np.zeros(len(led), dtype=int), led)
+        pose = np.array([[x, y, heading, height]])
+        told, covariance = self._pose_covariances(rows, pose, sigma, sigma_heading)
+        if not told[0]:
+            raise ValueError(f"LEDs {list(channels)} do not tell the pose from there")
+        return np.asarray(covariance[0])
+
+    def _pose_covariances(
+        self, rows: _Rows, poses: NDArray[np.float64], sigma: float, sigma_heading: float
+    ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+        """Whether rows tell each pose, and its covariance, shape (poses, 3, 3)."""
         if self.covariance is None:
             raise ValueError(
                 "this calibration has no covariance: it is nominal, nothing was measured"
             )
-        rows = [self.leds.index(channel) for channel in channels]
-        pose = np.array([[x, y, heading, height]])
-        jacobian = _Rows(np.zeros(len(rows), dtype=int), np.array(rows)).jacobian(
-            self.camera, self.leds.positions, pose
-        )
-        by_name = dict(zip(_names(self.camera, self.leds), jacobian.T, strict=False))
-        along = jacobian[:, -3:]
-        prior = np.zeros((3, 3))
-        if sigma_heading == 0:
-            along = along[:, :2]
-            prior = prior[:2, :2]
-        else:
-            prior[2, 2] = (sigma / sigma_heading) ** 2
-        normal = along.T @ along + prior
-        if np.linalg.cond(normal / np.sqrt(np.outer(np.diag(normal), np.diag(normal)))) > 1e12:
-            raise ValueError(f"LEDs {list(channels)} do not tell the pose from there")
-        change = np.linalg.solve(
-            normal, along.T @ np.stack([by_name[n] for n in self.names], axis=1)
-        )
-        covariance = np.zeros((3, 3))
-        size = len(normal)
-        covariance[:size, :size] = change @ self.covariance @ change.T
-        return covariance
+        common, moved = rows.blocks(self.camera, self.leds.positions, poses)
+        known = _names(self.camera, self.leds)
+        of_names = rows.by_pose(common[:, [known.index(name) for name in self.names]], len(poses))
+        size = 2 if sigma_heading == 0 else 3
+        along = rows.by_pose(moved[:, :size], len(poses))
+        normal = along.mT @ along
+        if sigma_heading != 0:
+            normal[:, 2, 2] += (sigma / sigma_heading) ** 2
+        scale = np.sqrt(np.diagonal(normal, axis1=1, axis2=2))
+        scale[scale == 0] = 1.0
+        scaled = normal / (scale[:, :, None] * scale[:, None, :])
+        told = np.linalg.cond(scaled) <= 1e12
+        change = np.zeros((len(poses), 3, len(self.names)))
+        change[told, :size] = np.linalg.solve(normal[told], (along.mT @ of_names)[told])
+        return told, change @ self.covariance @ change.mT
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the calibration as a file, which `load_calibration` reads back bit for bit.
@@ -773,22 +780,43 @@ class _Rows(NamedTuple):
         """Optical X, Y and distance of each, shape (rows, 3)."""
         return np.asarray(optical(positions, *poses.T)[self.pose, self.led])
 
+    def blocks(
+        self, camera: Camera, positions: NDArray[np.float64], poses: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Change of the spikes with camera and LEDs, and with the pose of each, px per unit."""
+        points = self.points(positions, poses)
+        by_x, _, by_distance = camera.jacobian(points).T
+        turned = poses[self.pose, 2]
+        moved = by_pose(
+            by_x, by_distance, points[:, 0], points[:, 2], np.cos(turned), np.sin(turned)
+        )
+        first = len(camera.names)
+        common = np.zeros((len(points), first + 2 * len(positions)))
+        common[:, :first] = camera.parameter_jacobian(points)
+        number = np.arange(len(points))
+        for axis in (0, 1):
+            common[number, first + 2 * self.led + axis] = -moved[axis]
+        return common, np.stack(moved, axis=1)
+
     def jacobian(
         self, camera: Camera, positions: NDArray[np.float64], poses: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Change of the spikes with everything, px per unit."""
-        points = self.points(positions, poses)
-        moved = pose_jacobian(camera, positions, *poses.T)[self.pose, self.led].T
-        first = len(camera.names)
-        last = first + 2 * len(positions)
-        jacobian = np.zeros((len(points), last + 3 * len(poses)))
-        jacobian[:, :first] = camera.parameter_jacobian(points)
-        number = np.arange(len(points))
-        for axis in (0, 1):
-            jacobian[number, first + 2 * self.led + axis] = -moved[axis]
+        common, moved = self.blocks(camera, positions, poses)
+        jacobian = np.zeros((len(common), common.shape[1] + 3 * len(poses)))
+        jacobian[:, : common.shape[1]] = common
         for axis in (0, 1, 2):
-            jacobian[number, last + 3 * self.pose + axis] = moved[axis]
+            column = common.shape[1] + 3 * self.pose + axis
+            jacobian[np.arange(len(common)), column] = moved[:, axis]
         return jacobian
+
+    def by_pose(self, values: NDArray[np.float64], poses: int) -> NDArray[np.float64]:
+        """Put what each row has, shape (rows, …), to its pose: (poses, most rows of one, …), else 0."""
+        counts = np.bincount(self.pose, minlength=poses)
+        slot = np.arange(len(self.pose)) - np.repeat(np.cumsum(counts) - counts, counts)
+        table = np.zeros((len(counts), counts.max(initial=0), *values.shape[1:]))
+        table[self.pose, slot] = values
+        return table
 
 
 class _Bundle:
@@ -821,8 +849,12 @@ class _Bundle:
                 for what in ("x", "y", "heading")
             ),
         )
+        tangents = np.split(
+            camera.tangent(self.pixels), np.cumsum([len(o.channels) for o in observations])
+        )
         starts = [
-            _start(number, seen, leds, camera) for number, seen in enumerate(observations, start=1)
+            _start(number, seen, leds, camera, tangents[number - 1])
+            for number, seen in enumerate(observations, start=1)
         ]
         self.first = len(camera.names)
         self.last = self.first + 2 * len(leds)
@@ -1149,17 +1181,10 @@ class _Bundle:
         """Say what all that is not known does to poses such as those observed."""
         said = []
         for case, sigma_heading in (("known", 0.0), ("found", math.inf)):
-            spreads = []
-            for seen, pose in zip(self.observations, poses.tolist(), strict=True):
-                x, y, heading, height = pose
-                try:
-                    covariance = calibration.pose_covariance(
-                        seen.channels, x, y, heading, height=height, sigma_heading=sigma_heading
-                    )
-                except ValueError:  # too few LEDs for that
-                    continue
-                spreads.append(np.sqrt(np.diag(covariance)))
-            if spreads:
+            # some have too few LEDs for that
+            told, covariance = calibration._pose_covariances(self.rows, poses, 1.0, sigma_heading)
+            spreads = np.sqrt(np.diagonal(covariance[told], axis1=1, axis2=2))
+            if len(spreads):
                 x, y = np.median(spreads, axis=0)[:2]
                 worst_x, worst_y = np.max(spreads, axis=0)[:2]
                 said.append(
@@ -1230,11 +1255,10 @@ def _loss(loss: Loss, z: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _start(
-    number: int, seen: Observation, leds: LedMap, camera: Camera
+    number: int, seen: Observation, leds: LedMap, camera: Camera, tangents: NDArray[np.float64]
 ) -> tuple[float, float, float]:
     """A pose to begin with: what is known of it, and the rest from the spikes."""
     positions = leds.positions[[leds.index(channel) for channel in seen.channels]]
-    tangents = camera.tangent(seen.pixels)
     placed = math.isfinite(seen.x.sigma) and math.isfinite(seen.y.sigma)
     turned = math.isfinite(seen.heading.sigma)
     x, y, heading = seen.x.value, seen.y.value, seen.heading.value

@@ -442,7 +442,7 @@ class Camera:
         rays : tuple of int
             As for `raytransfer.irradiance.pixel_response`.
         """
-        from raytransfer.irradiance import pixel_response
+        from raytransfer.irradiance import disc_image, pixel_response
         from tracking.spikes import SpikeFinder
 
         check.not_negative("extent", extent, "a diameter in mm")
@@ -455,10 +455,8 @@ class Camera:
             point = pixel_response(
                 system, (x, y, distance), fine, wavelength=wavelength, rays=rays, threads=1
             )
-            radius = extent / 2 * length / distance / fine.pitch
-            across = np.arange(-math.floor(radius), math.floor(radius) + 1)
-            disc = np.sqrt(np.maximum(radius**2 - across**2, 0.0)) + (radius == 0)
-            blurred = np.convolve(point, disc / disc.sum(), mode="same")
+            size = extent * length / distance / fine.pitch
+            blurred = np.convolve(point, disc_image(size, chords=True), mode="same")
             return np.asarray(blurred.reshape(-1, FINE).sum(axis=1))
 
         meridian = system.matrix("y", wavelength=wavelength)

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple, Self
 import numpy as np
 
 from raytransfer import _checks as check
-from raytransfer.irradiance import pixel_response
+from raytransfer.irradiance import disc_image, pixel_response
 from raytransfer.sensors import TCD1304
 from raytransfer.tolerances import Tolerances, perturb
 from tracking.camera import PEAK
@@ -510,19 +510,10 @@ def _width(
             "falls on the line; take a smaller half_field"
         )
     size = extent * abs(float(camera.jacobian(place)[0]))
-    light = np.convolve(light, _disc(size), "same")
+    light = np.convolve(light, disc_image(size), "same")
     spike = finder.profile(light * (PEAK / light.max()))
     # in focus, light on one pixel is no spike
     return spike.width if spike.found else 1.0
-
-
-def _disc(diameter: float) -> NDArray[np.float64]:
-    """Shares of a disc's light by pixel, its image being `diameter` px across."""
-    if diameter < 1e-6:
-        return np.ones(1)
-    reach = math.ceil(diameter / 2 - 0.5)
-    edges = np.clip((np.arange(2 * reach + 2) - reach - 0.5) / (diameter / 2), -1, 1)
-    return np.asarray(np.diff(edges * np.sqrt(1 - edges**2) + np.arcsin(edges)) / math.pi)
 
 
 RAYS = (192, 48)

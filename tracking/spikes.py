@@ -374,6 +374,9 @@ _NO_CHARGE = np.empty(0)
 _WHOLE_LINE = np.empty((0, 2), np.int64)
 _FLAGS = tuple(SpikeFlags(n) for n in range(32))
 _COLUMNS = 5
+# as integers: an IntFlag's operators are slow
+_INVALID = int(FrameFlags.INVALID)
+_MISSING = int(SpikeFlags.MISSING)
 
 
 class SpikeFinder:
@@ -470,7 +473,7 @@ class SpikeFinder:
             places = np.array(windows, dtype=np.int64)
             if places.shape != (rows, 2):
                 raise ValueError(f"windows: pairs (first, last) are needed, not {windows!r}")
-        if frame.flags & FrameFlags.INVALID:
+        if int(frame.flags) & _INVALID:
             return [] if windows is None else [MISSING] * rows
         out = np.empty((rows, _COLUMNS))
         count = _kernels().find(
@@ -528,6 +531,6 @@ def _kernels() -> ModuleType:
 
 def _spike(row: list[float]) -> Spike:
     position, sigma, width, height, flags = row
-    if flags == SpikeFlags.MISSING:
+    if flags == _MISSING:
         return MISSING
     return Spike(position, sigma, width, height, _FLAGS[int(flags)])

@@ -18,18 +18,20 @@ EVERYTHING = -1  # who is blocked: all LEDs at once
 
 
 @_compile
+def mixed(value):
+    """Stir the bits of a number (the last step of splitmix64)."""
+    value = (value ^ (value >> uint64(30))) * uint64(0xBF58476D1CE4E5B9)
+    value = (value ^ (value >> uint64(27))) * uint64(0x94D049BB133111EB)
+    return value ^ (value >> uint64(31))
+
+
+@_compile
 def uniform(seed, who, what, number):
     """Random number from 0 to 1 that belongs to its arguments (splitmix64)."""
     value = uint64(seed) + uint64(0x9E3779B97F4A7C15) * uint64(who + 2)
     for more in (what + 1, number + 1):
-        value = (value ^ (value >> uint64(30))) * uint64(0xBF58476D1CE4E5B9)
-        value = (value ^ (value >> uint64(27))) * uint64(0x94D049BB133111EB)
-        value ^= value >> uint64(31)
-        value += uint64(0x9E3779B97F4A7C15) * uint64(more)
-    value = (value ^ (value >> uint64(30))) * uint64(0xBF58476D1CE4E5B9)
-    value = (value ^ (value >> uint64(27))) * uint64(0x94D049BB133111EB)
-    value ^= value >> uint64(31)
-    return float(value >> uint64(11)) / 9007199254740992.0
+        value = mixed(value) + uint64(0x9E3779B97F4A7C15) * uint64(more)
+    return float(mixed(value) >> uint64(11)) / 9007199254740992.0
 
 
 @_compile

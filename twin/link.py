@@ -21,8 +21,6 @@ from twin.sensor import Electronics, SensorModel
 from twin.world import World
 
 if TYPE_CHECKING:
-    from types import TracebackType
-
     from numpy.typing import NDArray
 
 SPI_CLOCK = 15_625_000
@@ -213,12 +211,7 @@ class TwinLink:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 

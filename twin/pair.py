@@ -26,7 +26,6 @@ from twin.world import STRAIGHT, Mount
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
-    from types import TracebackType
 
     from acquisition.protocol import Command
     from twin.world import World
@@ -229,10 +228,5 @@ class TwinPair:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

@@ -19,7 +19,7 @@ from acquisition.frames import MASTER_CLOCK
 from acquisition.protocol import check_periods
 from raytransfer import TCD1304
 from raytransfer import _checks as check
-from raytransfer.irradiance import photon_energy, pixel_response
+from raytransfer.irradiance import disc_image, photon_energy, pixel_response
 from raytransfer.localisation import Noise, spike_bound
 from tracking.spikes import Spike, SpikeFinder, SpikeFlags
 
@@ -34,8 +34,8 @@ DIFFUSION = 0.003
 
 _FLAGS = tuple(SpikeFlags(n) for n in range(32))
 
-FINE = 8
-"""Parts of a pixel in which light is blurred by the LED's size."""
+FINE = 9
+"""Parts of a pixel in which light is blurred by the LED's size; odd, so that one is its middle."""
 
 
 class SpikeTable:
@@ -175,16 +175,11 @@ class SpikeTable:
 
 def _blur(disc: float, sigma: float) -> NDArray[np.float64]:
     """Image of a disc of this diameter, px, spread by diffusion of this standard deviation, px."""
-    half = math.ceil(disc / 2 + 4 * sigma) + 1
-    fine = (np.arange((2 * half + 1) * FINE) + 0.5) / FINE - half - 0.5
-    step = 1 / FINE
-    # a disc's chords, exactly over each part: its area is known in closed form
-    edges = np.clip(np.append(fine - step / 2, fine[-1] + step / 2) / (disc / 2 or 1e-9), -1, 1)
-    area = (edges * np.sqrt(1 - edges**2) + np.arcsin(edges)) / math.pi
-    spread = np.exp(-0.5 * (fine / sigma) ** 2)
-    image = np.convolve(np.diff(area), spread / spread.sum(), "same")
-    weights = image.reshape(-1, FINE).sum(axis=1)
-    return np.asarray(weights / weights.sum())
+    reach = math.ceil(4 * sigma * FINE)
+    spread = np.exp(-0.5 * (np.arange(-reach, reach + 1) / (sigma * FINE)) ** 2)
+    image = np.convolve(disc_image(disc * FINE), spread / spread.sum())
+    beside = (FINE - len(image)) // 2 % FINE  # parts that are missing of the outermost pixels
+    return np.asarray(np.pad(image, beside).reshape(-1, FINE).sum(axis=1))
 
 
 @dataclass(frozen=True)
@@ -386,14 +381,14 @@ class SpikeWorld:
         self._rows = {led.channel: row for row, led in enumerate(self.leds)}
         if len(self._rows) != len(self.leds):
             raise ValueError("leds: each channel may be used once")
-        self._positions = np.array([led.position for led in self.leds])
+        positions = np.array([led.position for led in self.leds])
         facings = np.array([led.facing for led in self.leds])
-        self._normals = np.column_stack([-np.sin(facings), np.cos(facings)])
+        normals = np.column_stack([-np.sin(facings), np.cos(facings)])
         powers = np.array([led.power for led in self.leds])
-        self._rates = powers / math.pi * table.electrons_per_joule
+        rates = powers / math.pi * table.electrons_per_joule
         self._kernels = load_kernels()
         f = self.faults
-        self._episodes = np.array(
+        episodes = np.array(
             [
                 *(f.blocked_every, f.blocked, f.dark_every, f.dark, f.longest),
                 *(f.mirror_every, f.mirror),
@@ -413,7 +408,8 @@ class SpikeWorld:
         self._block = -1
         self._poses = np.empty((0, 3))
         self._last = float(table.sensor.pixels - 1)
-        self._table = (table.axes, table.fields)
+        # what the kernels know of it, in their order
+        self._room = (positions, normals, rates, (table.axes, table.fields), self._last, episodes)
 
     def time_ns(self, frame: int) -> int:
         """When a frame's exposure ends, ns."""
@@ -435,12 +431,7 @@ class SpikeWorld:
             self._seed,
             self.time_ns(frame) * 1e-9,
             self.pose(frame),
-            self._positions,
-            self._normals,
-            self._rates,
-            self._table,
-            self._last,
-            self._episodes,
+            *self._room,
             self.sh_period / self._clock,
             self._least,
         )
@@ -479,12 +470,7 @@ class SpikeWorld:
             self._draw(len(rows)),
             self.time_ns(frame) * 1e-9,
             self.pose(frame),
-            self._positions,
-            self._normals,
-            self._rates,
-            self._table,
-            self._last,
-            self._episodes,
+            *self._room,
             self._noise,
             rows,
             seconds,

@@ -35,14 +35,15 @@ from acquisition.protocol import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-    from types import TracebackType
+    from collections.abc import Callable, Iterable
 
     from numpy.typing import NDArray
 
 BYTE = 8 / 15.6e6  # s
 STALL = {Mode.ORIGINAL: 50e-3, Mode.STREAM: 1e-3, Mode.SPIKES: 1e-3}  # s
 FLUSH = 3 * 15000 / MASTER_CLOCK  # s
+LEDS = [{0: 100}, {1: 60}, {}, {0: 100, 1: 30}]
+WINDOWS = [[(0, 99)], [(7, 300), (400, 500)], [], [(1, 3000)]]
 _PATTERN = (3900 + np.random.default_rng(1304).integers(-3, 4, ELEMENTS)).astype(np.uint16)
 
 
@@ -58,6 +59,26 @@ def spikes_at(number: int) -> tuple[OnboardSpike, ...]:
     """What the fake firmware finds there: one spike, or two."""
     first = OnboardSpike(100 + 37 * (number % 90) + 10.5, 20.0, 500 + number % 977, 0, 0)
     return (first, first._replace(position=3600.25, height=99))[: 1 + number % 2]
+
+
+def stream(count: int = 0) -> Command:
+    return Command(100, 20000, count, Mode.STREAM, LEDS)
+
+
+def spikes(count: int = 0) -> Command:
+    return Command(100, 20000, count, Mode.SPIKES, LEDS, WINDOWS)
+
+
+def check(frames: Iterable[Frame | SpikeFrame]) -> None:
+    """Every frame is one that the device has taken."""
+    for frame in frames:
+        assert frame.timestamp is not None
+        number = frame.timestamp // 1000
+        if isinstance(frame, SpikeFrame):
+            assert frame.spikes == spikes_at(number)
+            assert frame.dark_level == 3900.5
+        else:
+            np.testing.assert_array_equal(frame.elements, elements_at(number))
 
 
 class FakeMcu:
@@ -130,12 +151,7 @@ class FakeMcu:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     # --- SPI

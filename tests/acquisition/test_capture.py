@@ -27,29 +27,25 @@ from acquisition.protocol import (
     crc32_words,
     encode_status,
 )
-from tests.acquisition.fake_mcu import BREAKS, FakeMcu, FaultyWire, elements_at
+from tests.acquisition.fake_mcu import (
+    BREAKS,
+    LEDS,
+    FakeMcu,
+    FaultyWire,
+    check,
+    elements_at,
+    spikes,
+    stream,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from acquisition.frames import Frame
 
-LEDS = [{0: 100}, {1: 60}, {}, {0: 100, 1: 30}]
-
 
 def original(count: int = 2) -> Command:
     return Command(100, 30000, count)
-
-
-def stream(count: int = 0) -> Command:
-    return Command(100, 20000, count, Mode.STREAM, LEDS)
-
-
-def check(frames: Iterable[Frame]) -> None:
-    """Every frame is one that the device has taken."""
-    for frame in frames:
-        assert frame.timestamp is not None
-        np.testing.assert_array_equal(frame.elements, elements_at(frame.timestamp // 1000))
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7])
@@ -602,12 +598,16 @@ def test_interrupted_original_mode_keeps_what_came() -> None:
         np.testing.assert_array_equal(frame.elements, elements_at(n))
 
 
+STREAMS = pytest.mark.parametrize("command", [stream(), spikes()], ids=["stream", "spikes"])
+
+
+@STREAMS
 @pytest.mark.parametrize("fault", sorted(BREAKS))
-def test_one_fault_costs_two_frames_at_most(fault: str) -> None:
+def test_one_fault_costs_two_frames_at_most(command: Command, fault: str) -> None:
     for at in range(12):
         link = FaultyWire(at, 1.0, [fault])
         link.quiet = True
-        frames = Capture(link, stream())
+        frames = Capture(link, command)
         found = [next(frames) for _ in range(4)]
         link.quiet = False
         link.once = True
@@ -620,11 +620,12 @@ def test_one_fault_costs_two_frames_at_most(fault: str) -> None:
         assert frames.statistics.restarts == 0
 
 
+@STREAMS
 @pytest.mark.parametrize("seed", range(12))
-def test_stream_over_a_bad_wire(seed: int) -> None:
+def test_stream_over_a_bad_wire(command: Command, seed: int) -> None:
     faults = [*BREAKS, "flip tx", "bounce", "deaf", "reset"]
     link = FaultyWire(seed, 0.08, faults)
-    frames = Capture(link, stream(), retries=20)
+    frames = Capture(link, command, retries=20)
     found = []
     for n in range(150):
         if n % 25 == 0:
@@ -635,8 +636,9 @@ def test_stream_over_a_bad_wire(seed: int) -> None:
     numbers = [frame.sequence for frame in found]
     assert numbers == sorted(set(numbers))
     for frame in found:
-        if frame.exposures:
+        if frame.exposures and frame.timestamp is not None:
             assert sum(1 << n for n in frame.exposures) == frame.leds
+            assert frame.exposures == link.lit[frame.timestamp // 1000]
     link.quiet = True
     while frames.command.sequence != ({7: 10}, {0: 99}):
         check([next(frames)])

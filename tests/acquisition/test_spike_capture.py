@@ -14,26 +14,10 @@ from acquisition.frames import Frame, FrameFlags, SpikeFrame
 from acquisition.links import LinkError, LinkTimeout, ReplayLink
 from acquisition.protocol import FULL_WINDOW, Command, CommandError, Mode, Refusal
 from acquisition.session import SessionError, SessionWriter
-from tests.acquisition.fake_mcu import BREAKS, FakeMcu, FaultyWire, elements_at, spikes_at
+from tests.acquisition.fake_mcu import LEDS, FakeMcu, FaultyWire, check, elements_at, spikes
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
     from pathlib import Path
-
-LEDS = [{0: 100}, {1: 60}, {}, {0: 100, 1: 30}]
-WINDOWS = [[(0, 99)], [(7, 300), (400, 500)], [], [(1, 3000)]]
-
-
-def spikes(count: int = 0) -> Command:
-    return Command(100, 20000, count, Mode.SPIKES, LEDS, WINDOWS)
-
-
-def check(frames: Iterable[SpikeFrame]) -> None:
-    """Every frame is one that the device has taken."""
-    for frame in frames:
-        assert frame.timestamp is not None
-        assert frame.spikes == spikes_at(frame.timestamp // 1000)
-        assert frame.dark_level == 3900.5
 
 
 def test_spikes_come_with_all_that_is_known_of_their_frame() -> None:
@@ -117,39 +101,6 @@ def test_only_the_first_start_awaits_an_edge() -> None:
     check(islice(frames, 3))
     assert link.injected == ["reset"]
     assert not link.commands[-1].await_sync
-
-
-@pytest.mark.parametrize("fault", sorted(BREAKS))
-def test_one_fault_costs_two_frames_at_most(fault: str) -> None:
-    for at in range(12):
-        link = FaultyWire(at, 1.0, [fault])
-        link.quiet = True
-        frames = SpikeCapture(link, spikes())
-        found = list(islice(frames, 4))
-        link.quiet, link.once = False, True
-        found += islice(frames, 6)
-        check(found)
-        assert found[-1].sequence + 1 - len(found) <= 2
-        assert link.injected == [fault]
-        assert frames.statistics.restarts == 0
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_spikes_over_a_bad_wire(seed: int) -> None:
-    link = FaultyWire(seed, 0.08, [*BREAKS, "flip tx", "bounce", "deaf", "reset"])
-    frames = SpikeCapture(link, spikes(), retries=20)
-    found = []
-    for n in range(150):
-        if n % 25 == 0:
-            frames.send([{n // 25 + 2: 10}, {0: 99}])
-        found.append(next(frames))
-    check(found)
-    assert len(link.injected) > 5
-    numbers = [frame.sequence for frame in found]
-    assert numbers == sorted(set(numbers))
-    for frame in found:
-        if frame.exposures and frame.timestamp is not None:
-            assert frame.exposures == link.lit[frame.timestamp // 1000]
 
 
 def test_older_firmware_refuses() -> None:

@@ -27,6 +27,8 @@ from raytransfer.illumination import pixel_solid_angles
 from raytransfer.irradiance import (
     EnergyBudget,
     LightTable,
+    disc,
+    disc_image,
     irradiance,
     photon_energy,
     pixel_budget,
@@ -299,6 +301,28 @@ def test_a_large_emitter_is_blurred_by_its_image() -> None:
     rise, fall = np.maximum.accumulate(level[:top]), np.maximum.accumulate(level[:top:-1])
     assert (rise - level[:top]).max() < 0.02
     assert (fall - level[:top:-1]).max() < 0.02
+
+
+@pytest.mark.parametrize("diameter", [0.0, 0.7, 1.0, 2.6, 8.0, 20.3, 183.0])
+def test_the_image_of_a_disc_is_what_many_points_make(diameter: float) -> None:
+    """Shares of its points by part of the line; by chords, the same where parts are fine."""
+    image = disc_image(diameter)
+    half = len(image) // 2
+    places, shares = zip(*disc((0.0, 0.0, 1.0), diameter, 100_001), strict=True)
+    edges = np.arange(-half - 0.5, half + 1)
+    points, _ = np.histogram([x for x, _, _ in places], edges, weights=shares)
+    assert image == pytest.approx(points, abs=3e-5)
+    assert image.sum() == pytest.approx(1.0, abs=1e-12)
+    chords = disc_image(diameter, chords=True)
+    assert chords.sum() == pytest.approx(1.0, abs=1e-12)
+    chords = np.pad(chords, (len(image) - len(chords)) // 2)
+    assert np.abs(chords - image).sum() < (0.01 if diameter > 20 else 0.5)
+
+
+def test_a_disc_without_a_size_is_refused() -> None:
+    for diameter in (-1.0, np.nan):
+        with pytest.raises(ValueError, match="diameter"):
+            disc_image(diameter)
 
 
 def test_threads_change_nothing() -> None:

@@ -298,6 +298,11 @@ def surveyed() -> list[Observation]:
     return seen(turned(2), STAGGERED, noise=0.05, known=(0.5, 0.002))
 
 
+@pytest.fixture(scope="module")
+def straight(surveyed: list[Observation]) -> Calibration:
+    return bundle(surveyed, STAGGERED, CAMERA, led_sigma=5.0)
+
+
 @pytest.mark.parametrize("pair", [(3, 5), (0, 1)])
 def test_swapped_channels_are_named(surveyed: list[Observation], pair: tuple[int, int]) -> None:
     a, b = pair
@@ -334,11 +339,12 @@ def test_signs_and_orders_the_other_way_are_named(surveyed: list[Observation]) -
         bundle(surveyed, STAGGERED, Camera(-4200.0), led_sigma=5.0)
 
 
-def test_a_mirrored_line_is_calibrated_as_such(surveyed: list[Observation]) -> None:
+def test_a_mirrored_line_is_calibrated_as_such(
+    surveyed: list[Observation], straight: Calibration
+) -> None:
     """Read from the other end, with a camera that says so."""
     mirrored = [replace(o, pixels=3647 - np.asarray(o.pixels)) for o in surveyed]
     found = bundle(mirrored, STAGGERED, Camera(-4100.0, 1800.0, pupil=CAMERA.pupil), led_sigma=5.0)
-    straight = bundle(surveyed, STAGGERED, CAMERA, led_sigma=5.0)
     assert found.camera.scale == pytest.approx(-straight.camera.scale, abs=0.01)
     assert found.camera.centre == pytest.approx(3647 - straight.camera.centre, abs=0.01)
 
@@ -404,13 +410,18 @@ def test_a_model_error_that_does_not_settle_is_noted(
     assert (count, "settled" in notes) == (2, False)
 
 
-def test_notes_say_what_is_left_open_in_mm(surveyed: list[Observation]) -> None:
+def test_notes_say_what_is_left_open_in_mm(
+    surveyed: list[Observation], straight: Calibration
+) -> None:
     """A centre a few px off is an x a few mm off where the heading is known."""
     pattern = r"± (\S+) mm in x and ± (\S+) mm in y with a \w+ heading \(at worst (\S+) and (\S+)\)"
-    found = bundle(surveyed, STAGGERED, CAMERA, led_sigma=5.0)
-    for told, sigma_heading in zip(re.findall(pattern, found.notes), (0.0, math.inf), strict=True):
+    for told, sigma_heading in zip(
+        re.findall(pattern, straight.notes), (0.0, math.inf), strict=True
+    ):
         spread = [
-            np.sqrt(np.diag(found.pose_covariance(o.channels, *pose, sigma_heading=sigma_heading)))
+            np.sqrt(
+                np.diag(straight.pose_covariance(o.channels, *pose, sigma_heading=sigma_heading))
+            )
             for o, pose in zip(surveyed, turned(2), strict=True)
             if len(o.channels) > 2
         ]
@@ -485,6 +496,19 @@ def test_a_straight_rail_and_free_poses_do_not_tell_the_scale() -> None:
     assert abs(found.camera.scale - 3500.0) < 4 * found.sigma("scale")
     places = seen(turned(1), RAIL, camera=pinhole, noise=0.05, known=(0.5, math.inf))
     assert bundle(places, RAIL, pinhole, **options).sigma("scale") < 5.0
+
+
+def test_a_pose_without_spikes_changes_nothing(
+    surveyed: list[Observation], straight: Calibration
+) -> None:
+    blind = Observation([], [], 0.1, Prior(0.0, 0.5), Prior(2000.0, 0.5), Prior(0.0, 0.01))
+    for more in ([*surveyed, blind], [blind, *surveyed]):
+        found = bundle(more, STAGGERED, CAMERA, led_sigma=5.0)
+        np.testing.assert_allclose(
+            found.camera.parameters, straight.camera.parameters, rtol=1e-6, atol=1e-8
+        )
+    with pytest.raises(ValueError, match=r"LEDs \[\] do not tell the pose"):
+        straight.pose_covariance([], 0.0, 2000.0)
 
 
 def test_with_free_distortion_a_straight_rail_tells_the_scale_badly() -> None:

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from raytransfer.designs import DESIGNS
-from raytransfer.irradiance import disc, disc_points, pixel_response
+from raytransfer.irradiance import disc, disc_image, disc_points, pixel_response
 from raytransfer.tolerances import Tolerances, perturb
 from tracking.camera import Camera
 from tracking.poses import Prior, optical
-from tracking.ranging import RELATIVE_LIMIT, WIDTH_NOISE, RangeFinder, RangeFlags, _disc
+from tracking.ranging import RELATIVE_LIMIT, WIDTH_NOISE, RangeFinder, RangeFlags
 from tracking.spikes import Spike, SpikeFinder, SpikeFlags
 
 if TYPE_CHECKING:
@@ -145,15 +145,13 @@ def test_a_disc_is_what_many_points_make() -> None:
     light = pixel_response(system, place, wavelength=0.63)
     points = disc(place, extent, disc_points(system, extent, place[2]))
     whole = np.sum([s * pixel_response(system, p, wavelength=0.63) for p, s in points], axis=0)
-    kernel = _disc(extent * abs(float(camera.jacobian(place)[0])))
-    assert kernel.sum() == pytest.approx(1.0)
+    kernel = disc_image(extent * abs(float(camera.jacobian(place)[0])))
     finder = SpikeFinder()
     widths = [
         finder.profile(profile * (24_500 / profile.max())).width
         for profile in (np.convolve(light, kernel, "same"), whole)
     ]
     assert widths[0] == pytest.approx(widths[1], rel=0.01)
-    assert _disc(0.0).tolist() == [1.0]
 
 
 class Head:
@@ -168,7 +166,7 @@ class Head:
         """Electrons of an LED, without noise."""
         place = (-tangent * distance, 0.0, distance)
         light = pixel_response(self.system, place, wavelength=0.63, rays=(256, 64))
-        light = np.convolve(light, _disc(2.0 * 4200.0 / distance), "same")
+        light = np.convolve(light, disc_image(2.0 * 4200.0 / distance), "same")
         return np.asarray(light * (24_500 / light.max()))
 
     def spikes(self, count: int, near: float, far: float) -> list[tuple[float, Spike]]:

@@ -475,6 +475,64 @@ def test_a_spike_over_the_end_is_flagged(detector: Detector) -> None:
     assert finder(read(PEAK * gaussian(20, -8.0) + AMBIENT, rng)) == []
 
 
+def test_the_search_by_blocks_misses_nothing() -> None:
+    """Against the significance of every place at every scale, of lines and of windows."""
+    from tracking import _spikes as kernels
+
+    rng = np.random.default_rng(14)
+    least, wander = 36.0, 400.0
+    found = 0
+    for n in range(2000):
+        bins = int(rng.integers(3, PIXELS // 4 + 1)) if n % 2 else PIXELS // 4
+        place = np.arange(4 * bins)
+        expected = np.full(4 * bins, rng.choice([0.0, 300.0, 14_000.0]))
+        for _ in range(rng.integers(0, 6)):  # narrow to broader than any spike, bright or dark
+            width, height = np.exp(rng.uniform(0, 6.5)), np.exp(rng.uniform(3, 11.4))
+            form = ((place - rng.uniform(-50, 4 * bins + 50)) / width) ** 2
+            expected += rng.choice([1.0, 1.0, -0.1]) * height * np.exp(-4 * math.log(2) * form)
+        expected += rng.choice([0.0, 0.0, 30_000.0]) * (place > rng.integers(4 * bins))
+        variance = 3800.0 + np.maximum(expected, 0.0)
+        charge = expected + np.sqrt(variance) * rng.standard_normal(4 * bins)
+        light, noise = np.zeros((2, bins + 1 + kernels.BLOCK))
+        light[1 : bins + 1] = charge.reshape(-1, 4).sum(axis=1).cumsum()
+        noise[1 : bins + 1] = variance.reshape(-1, 4).sum(axis=1).cumsum()
+        scores, scales, places = np.empty(4000), np.empty(4000, int), np.empty(4000, int)
+        count = kernels._scan(light, noise, bins, wander, least, scores, scales, places)
+        listed = [*zip(scales[:count].tolist(), places[:count].tolist(), strict=True)]
+        all_of_them = {}
+        for scale in range(kernels._scales(bins)):
+            wide, step = 2**scale, kernels._step(scale)
+            near = (wide + 1) // 2
+            far, floor = near + wide, wander * (4 * wide) ** 2
+            k = np.arange(kernels._places(bins, scale))
+            j = k * step
+            inside = (j >= far) & (j + wide + far <= bins)
+            i = j[inside]
+
+            def over(sums: Array, i: NDArray[np.int64] = i, wide: int = wide) -> Array:
+                return sums[i + wide] - sums[i]
+
+            own = over(noise) + floor
+            beside, around = (
+                over(sums, i - far) + over(sums, i + wide + near) for sums in (light, noise)
+            )
+            excess = over(light) - beside / 2
+            score = np.minimum(
+                excess * abs(excess) / (own + around / 4), over(light) * abs(over(light)) / own
+            )
+            every = np.empty(k.size)
+            every[inside] = score
+            every[~inside] = [
+                kernels._significance(light, noise, bins, int(at), wide, near, floor)
+                for at in j[~inside]
+            ]
+            all_of_them.update({(scale, int(at)): every[at] for at in k[every > least]})
+        assert listed == [*all_of_them]
+        assert np.allclose(scores[:count], [*all_of_them.values()], rtol=1e-9, atol=0)
+        found += count
+    assert found > 50_000  # 96 000 or so: the frames have something to miss
+
+
 # what is no spike -------------------------------------------------------------------------------
 
 

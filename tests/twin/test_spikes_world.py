@@ -60,6 +60,12 @@ def test_between_its_points_the_table_is_exact_light(degrees: Any, distance: Any
     assert light.max() == pytest.approx(expected, rel=0.25)
 
 
+def test_on_the_axis_a_spike_is_in_the_middle_of_the_line() -> None:
+    table, _ = head()
+    for distance in (600.0, 2000.0, 8000.0):
+        assert table.spike(0.0, distance)[0] == pytest.approx((TCD1304.pixels - 1) / 2, abs=0.01)
+
+
 def test_beyond_the_line_there_is_nothing() -> None:
     table, _ = head()
     assert math.isnan(table.spike(0.6, 2000.0)[0])
@@ -228,7 +234,8 @@ def test_an_hour_of_everything() -> None:
     assert not report.failures(), str(report)
     assert report.losses > 20, "nothing happened"
     assert len(report.recoveries) > 20
-    assert report.locked > 0.9 * report.frames
+    assert report.possible > 0.9 * report.frames
+    assert report.locked > 0.9 * report.possible
 
 
 def test_room_is_seen_from_anywhere() -> None:
