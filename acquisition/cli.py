@@ -21,6 +21,8 @@ except ModuleNotFoundError as missing:  # seen by who types `linetrack`, not a t
     raise SystemExit(
         f"linetrack: the command line needs {missing.name}: pip install 'linetrack[capture]'"
     ) from missing
+except KeyboardInterrupt:  # importing takes a while
+    raise SystemExit(130) from None
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -420,6 +422,8 @@ def main(arguments: list[str] | None = None) -> None:
     """
     try:
         app(arguments, prog_name="linetrack")
+    except KeyboardInterrupt:  # before click catches it
+        sys.exit(INTERRUPTED)
     except Exception as error:
         if _debug:
             raise

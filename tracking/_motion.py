@@ -1,7 +1,9 @@
 """Compiled Kalman filter and choice of LEDs: bare arrays, no checks, changed in place.
 
-`motion` and `scheduling` stand on it. The state is x, y, heading, their rates, the tracker's height
-and the gyroscope's bias.
+`motion` and `scheduling` stand on it. The state is x, y, heading, their rates, the tracker's height,
+the gyroscope's bias and the square of the height: light knows the square of a difference of heights
+only, (z − h)² = z² − 2 z h + h², which is linear in height and square, and not in the height alone.
+Where that is unknown, a slope at some height would be right for none.
 """
 
 from __future__ import annotations
@@ -15,14 +17,14 @@ from numba import njit
 from raytransfer._kernels import CACHE
 from tracking import camera
 
-X, Y, PHI, VX, VY, OMEGA, HEIGHT, BIAS = range(8)
-STATES = 8
-MOTION = 6  # of them what a short piece of path is fitted with
+X, Y, PHI, VX, VY, OMEGA, HEIGHT, BIAS, SQUARE = range(9)
+STATES = 9
 
 # outcomes of a measurement
 USED, REJECTED, UNSEEN = 0, 1, 2
 
 NEAR = 20.0  # mm before the centre of projection: nearer LEDs are not seen
+LEVEL = 1e-3  # mm of height, at least, at which slopes are taken: at 0 that by the height is 0
 
 _compile = njit(cache=CACHE, error_model="numpy", nogil=True)
 
@@ -35,15 +37,11 @@ _image = _compile(
 
 
 @_compile
-def project(state, doubt, led, lens, row):
+def project(state, led, lens, row):
     """Predicted pixel of an LED, NaN if it is far from the field; row gets its slopes by the state.
 
     The last two numbers of lens are the ends of the field, tangents: beyond, the polynomials of a
     camera mean nothing and may come back to the line.
-
-    Doubt is the variance of the height. Light knows the square of a height only: that of an unknown
-    one is expected to be Y² + doubt, and its slope must not vanish at Y = 0, or the filter would
-    think that it had no effect.
     """
     sin, cos = math.sin(state[PHI]), math.cos(state[PHI])
     east, north = led[0] - state[X], led[1] - state[Y]
@@ -52,15 +50,17 @@ def project(state, doubt, led, lens, row):
     depth = along + lens[2]
     if depth < NEAR or not lens[-2] * depth <= -across <= lens[-1] * depth:
         return math.nan
-    up = led[2] - state[HEIGHT]
-    up = math.copysign(math.sqrt(up * up + doubt), up) if doubt > 0.0 else up
+    square = led[2] * (led[2] - 2.0 * state[HEIGHT]) + state[SQUARE]
+    up = max(math.sqrt(max(square, 0.0)), LEVEL)
     pixel, by_x, by_y, by_z = _image(lens, across, up, along)
+    by_square = by_y / (2.0 * up)
     row[:] = 0.0
     row[X] = by_x * cos - by_z * sin
     row[Y] = by_x * sin + by_z * cos
     row[PHI] = by_x * along - by_z * across
-    row[HEIGHT] = -by_y
-    return pixel
+    row[HEIGHT] = -2.0 * led[2] * by_square
+    row[SQUARE] = by_square
+    return pixel + by_square * (square - up * up)  # an estimate may be a little below 0
 
 
 @_compile
@@ -85,8 +85,16 @@ def predict(state, cov, dt, density):
         cov[i, i + 3] += q * dt * dt / 2.0
         cov[i + 3, i] += q * dt * dt / 2.0
         cov[i + 3, i + 3] += q * dt
-    cov[HEIGHT, HEIGHT] += density[2] * dt
     cov[BIAS, BIAS] += density[3] * dt
+    walk = density[2] * dt
+    if walk > 0.0:  # h + w: its square grows by 2 h w + w²
+        height = state[HEIGHT]
+        square = max(state[SQUARE], height * height)
+        cov[HEIGHT, HEIGHT] += walk
+        cov[HEIGHT, SQUARE] += 2.0 * height * walk
+        cov[SQUARE, HEIGHT] += 2.0 * height * walk
+        cov[SQUARE, SQUARE] += (4.0 * square + 2.0 * walk) * walk
+        state[SQUARE] += walk
 
 
 @_compile
@@ -151,7 +159,7 @@ def measure(state, cov, led, lens, pixel, variance, blur, gate, row, column, res
 
     Variance is that of the spike, px²; blur that of the LED's place along the line, mm².
     """
-    predicted = project(state, cov[HEIGHT, HEIGHT], led, lens, row)
+    predicted = project(state, led, lens, row)
     result[0] = predicted
     if math.isnan(predicted):
         result[1] = math.nan
@@ -160,10 +168,16 @@ def measure(state, cov, led, lens, pixel, variance, blur, gate, row, column, res
     variance += blur * (row[X] * row[X] + row[Y] * row[Y])
     # terms of second order: a shift across times one along, over the distance, and heading squared
     east, north = led[0] - state[X], led[1] - state[Y]
-    bend = (cov[X, X] + cov[Y, Y]) / (east * east + north * north) + cov[PHI, PHI]
-    if cov[HEIGHT, HEIGHT] > 0.0:  # that of height is Y², whose slope changes
-        doubt, up = cov[HEIGHT, HEIGHT], led[2] - state[HEIGHT]
-        variance += 0.5 * (row[HEIGHT] * doubt) ** 2 / (up * up + doubt)
+    apart = east * east + north * north
+    bend = (cov[X, X] + cov[Y, Y]) / apart + cov[PHI, PHI]
+    if (
+        cov[SQUARE, SQUARE] > 0.0
+    ):  # its slopes change with the pose and, beside the distance, itself
+        by_height, by_square = row[HEIGHT], row[SQUARE]
+        doubt = by_height * by_height * cov[HEIGHT, HEIGHT]
+        doubt += 2.0 * by_height * by_square * cov[HEIGHT, SQUARE]
+        doubt += by_square * by_square * cov[SQUARE, SQUARE]
+        variance += (bend + cov[SQUARE, SQUARE] / (apart * apart)) * doubt
     return take(state, cov, pixel - predicted, variance, bend, gate, row, column, result)
 
 
@@ -183,7 +197,7 @@ def expect(state, cov, leds, normals, lens, last, pixels, sigmas, visible):
     row = np.empty(STATES)
     column = np.empty(STATES)
     for n in range(len(leds)):
-        pixel = project(state, cov[HEIGHT, HEIGHT], leds[n], lens, row)
+        pixel = project(state, leds[n], lens, row)
         pixels[n] = pixel
         sigmas[n] = math.inf if math.isnan(pixel) else math.sqrt(spread(cov, row, column))
         facing = (state[X] - leds[n, 0]) * normals[n, 0] + (state[Y] - leds[n, 1]) * normals[n, 1]
@@ -191,50 +205,52 @@ def expect(state, cov, leds, normals, lens, last, pixels, sigmas, visible):
 
 
 @_compile
-def fit(state, prior, doubt, ages, rows, pixels, variances, leds, lens, information):
+def fit(state, basis, prior, ages, rows, pixels, variances, leds, lens, information):
     """Fit a straight path at constant rates to spikes of some time; returns χ², NaN if it fails.
 
-    Ages are times minus that of the state, s; prior has the information on the six of `MOTION` at
-    their values 0 (rates) or at the start (places), doubt is the variance of the height.
-    Gauss–Newton with halved steps; information gets the normal matrix.
+    Ages are times minus that of the state, s. What is sought are multiples of the columns of basis,
+    to be added to the state: prior has the information that they are 0. Gauss–Newton with halved
+    steps; information gets the normal matrix.
     """
+    unknowns = basis.shape[1]
     row = np.empty(STATES)
-    at = state.copy()
+    slopes = np.empty(unknowns)
+    start = state.copy()
+    found, at, step = np.zeros(unknowns), np.zeros(unknowns), np.zeros(unknowns)
     best = math.inf
-    step = np.zeros(MOTION)
-    start = state[:MOTION].copy()
-    start[3:] = 0.0
     for _ in range(30):
         normal = prior.copy()
-        right = prior @ (start - at[:MOTION])
-        cost = (start - at[:MOTION]) @ right
+        right = -(prior @ at)
+        cost = -(at @ right)
         chi = 0.0
+        now = start + basis @ at
+        moved = now.copy()
         for n in range(len(pixels)):
-            moved = at.copy()
             for i in range(3):
-                moved[i] += ages[n] * at[i + 3]
-            predicted = project(moved, doubt, leds[rows[n]], lens, row)
+                moved[i] = now[i] + ages[n] * now[i + 3]
+            predicted = project(moved, leds[rows[n]], lens, row)
             if math.isnan(predicted):
                 chi = math.inf
                 break
-            variance = variances[n] + row[HEIGHT] * row[HEIGHT] * doubt
             for i in range(3):
                 row[i + 3] = ages[n] * row[i]
+            slopes[:] = row @ basis
             residual = pixels[n] - predicted
-            chi += residual * residual / variance
-            for i in range(MOTION):
-                right[i] += row[i] * residual / variance
-                for j in range(MOTION):
-                    normal[i, j] += row[i] * row[j] / variance
+            chi += residual * residual / variances[n]
+            for i in range(unknowns):
+                right[i] += slopes[i] * residual / variances[n]
+                for j in range(unknowns):
+                    normal[i, j] += slopes[i] * slopes[j] / variances[n]
         if not chi + cost < best:
             if np.abs(step[:2]).max() < 1e-3:
                 break
             step *= 0.5
-            at[:MOTION] = state[:MOTION] + step
+            at = found + step
             continue
         gained = best - chi - cost
         best = chi + cost
-        state[:MOTION] = at[:MOTION]
+        found[:] = at
+        state[:] = now
         information[:] = normal
         if gained < 1e-3:
             break
@@ -243,7 +259,7 @@ def fit(state, prior, doubt, ages, rows, pixels, variances, leds, lens, informat
         if not np.linalg.cond(scaled) < 1e12:
             return math.nan
         step = np.linalg.solve(scaled, right / size) / size
-        at[:MOTION] = state[:MOTION] + step
+        at = found + step
     return best
 
 
@@ -285,8 +301,9 @@ def choose(
     """Choose LEDs frame by frame, each time the one that is expected to tell most about the place.
 
     That is by how much a spike lowers the sum of the variances of x and y, times the probability
-    that the LED is seen and found; with each one chosen the covariance shrinks as it would. Spikes of a frame are to be `apart` px and three standard deviations each
-    apart. Chosen gets rows of LEDs, −1 where there is none.
+    that the LED is seen and found; with each one chosen the covariance shrinks as it would. Spikes
+    of a frame are to be `apart` px and three standard deviations each apart. Chosen gets rows of
+    LEDs, −1 where there is none.
     """
     frames, places = chosen.shape
     chosen[:] = -1
@@ -303,7 +320,7 @@ def choose(
         for n in range(len(leds)):
             pixels[n] = math.nan
             if chances[n] > 0.0:
-                pixels[n] = project(state, cov[HEIGHT, HEIGHT], leds[n], lens, rows[n])
+                pixels[n] = project(state, leds[n], lens, rows[n])
             if math.isnan(pixels[n]):
                 seen[n] = 0.0
                 continue

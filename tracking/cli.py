@@ -78,7 +78,12 @@ def track(
     csv: Annotated[bool, typer.Option("--csv", help="The same as CSV, with a header.")] = False,
     udp: Annotated[
         str | None,
-        typer.Option("--udp", metavar="HOST:PORT", help="The JSON object as a UDP datagram."),
+        typer.Option(
+            "--udp",
+            metavar="HOST:PORT",
+            help="The JSON object as a UDP datagram. If the network refuses some, the exit code is "
+            f"{DOUBTFUL}.",
+        ),
     ] = None,
     calibration: Annotated[
         Path | None,
@@ -181,6 +186,8 @@ def _run(*, json: bool, csv: bool, udp: str | None, method: str, **given: Any) -
         raise UsageError(f"{' and '.join(formats)}: one form of output at a time")
     if method not in METHODS:
         raise UsageError(f"--method {method}: allowed are {' and '.join(METHODS)}")
+    if udp is None and sys.stdout is None:
+        raise UsageError("standard output is closed, and poses are written there; or use --udp")
     if method == "thesis":
         if formats:
             raise UsageError(
@@ -216,6 +223,8 @@ def _writer(*, json: bool, csv: bool, udp: str | None) -> LineWriter | UdpWriter
             return output.UdpWriter(host, port)
         except OSError as error:
             raise UsageError(f"--udp {udp}: {error.strerror or error}") from error
+        except UnicodeError as error:  # of a name that the domain name system cannot hold
+            raise UsageError(f"--udp {udp}: {host!r} is no name of a host") from error
     if json:
         return output.LineWriter(sys.stdout, output.as_json)
     if csv:
@@ -251,6 +260,8 @@ def _follow(
     from tracking.poses import Prior
     from tracking.tracker import Tracker, default_schedule, first_command, follow
 
+    if heading is not None and not math.isfinite(heading):
+        raise UsageError(f"--heading {heading}: a number of degrees is needed")
     console = Console(stderr=True, quiet=quiet, highlight=False, soft_wrap=True)
     led_map = None if leds is None else read_leds(leds)
     if icg is None and not spikes and sh > 0:
@@ -287,13 +298,14 @@ def _follow(
         raise LinkError(watch.why())
     console.print(f"{poses} pose{'' if poses == 1 else 's'} of {tally.line()}")
     if complaint := writer.complaint():
+        console.quiet = False  # no summary: an error
         console.print(complaint, style="yellow", markup=False)
-    if pressed.is_set() and not 0 < count == poses:
-        return INTERRUPTED if count or not poses else 0
+    if pressed.is_set() and (poses < count or not poses):
+        return INTERRUPTED
     if poses < count:
         console.print(f"[yellow]{count} poses were asked for[/]; the link had no more frames")
         return DOUBTFUL
-    return DOUBTFUL if tally.doubtful else 0
+    return DOUBTFUL if tally.doubtful or complaint else 0
 
 
 def _thesis(
@@ -333,7 +345,7 @@ def _thesis(
     if not number and count:
         raise LinkError("the link had no two frames to send: is the recording empty?")
     if not quiet:
-        sys.stderr.write(f"{number} positions, {invalid} invalid\n")
+        typer.echo(f"{number} positions, {invalid} invalid", err=True)
     return DOUBTFUL if invalid or number < count else 0
 
 
@@ -413,7 +425,11 @@ def read_leds(path: Path) -> LedMap:
 
     channels: list[int] = []
     positions: list[list[float]] = []
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError as error:
+        raise UsageError(f"--leds {path}: it is no text") from error
+    for number, line in enumerate(lines, start=1):
         text = line.partition("#")[0].replace(",", " ").split()
         if not text:
             continue

@@ -42,6 +42,7 @@ _UNCERTAIN = int(SpikeFlags.CLIPPED | SpikeFlags.DOUBLE)
 _MISSING = int(SpikeFlags.MISSING)
 
 _LAST = TCD1304.pixels - 1
+_GYRO = -1  # instead of a channel
 
 RECORD = 256
 """Innovations that a filter remembers."""
@@ -53,6 +54,10 @@ REFUSED = 8
 
 _HISTORY = (1 << RECENT) - 1
 
+SQUARED = 2.0
+"""Times its standard deviation that the square of an unknown height is taken to be uncertain by:
+that of a normal distribution is not one itself, and is often far above its mean."""
+
 SHARE = 1 / 64
 """Of each innovation in the mean by which errors are judged to be as large as stated …"""
 INFLATED = 3.0
@@ -61,10 +66,12 @@ INFLATED = 3.0
 BEYOND = 200.0
 """How far beyond the ends of the line spikes are predicted, px."""
 
-MEMORY_NS = 250_000_000
-"""How old a spike may be in the search for a pose."""
 SPIKES = 40
-"""Most spikes that it takes."""
+"""Most spikes that the search for a pose takes."""
+SURE = 20
+"""So many are enough if they are of three LEDs, which fit some pose whatever they say …"""
+FEW = 7
+"""… or so many near the last pose, or when half the memory has passed without a fourth LED."""
 ROUGH = 2.5
 """Times the uncertainty at which lock is lost that a pose may begin with."""
 MANY = 5
@@ -168,7 +175,8 @@ class MotionFilter:
 
     Measurements are taken in by rising time. One that is older than the newest is refused
     (`Outcome.STALE`), as is a second one of the same LED at the same time: a frame that arrives
-    late or twice changes nothing.
+    late or twice changes nothing. Where nothing newer comes for all of `patience`, the clock must
+    have been set back: lock is lost, and the time is that of these from then on.
 
     Parameters
     ----------
@@ -180,11 +188,12 @@ class MotionFilter:
     angular : float
         The same of the heading, rad/s²/√Hz.
     height : Prior
-        The tracker's height, mm; a sigma above 0 makes it a state.
+        The tracker's height, mm; a sigma above 0 makes it a state, and its square another one.
     height_walk : float
         By how much height wanders, mm/√s.
     bias : Prior
-        Of the gyroscope, rad/s.
+        Of the gyroscope, rad/s. What was learnt of it is kept when lock is lost, taken for twice as
+        uncertain; or forgotten if the rates did not fit.
     bias_walk : float
         rad/s/√s.
     model_error : float, optional
@@ -196,7 +205,11 @@ class MotionFilter:
     gate : float
         Largest normalised innovation squared.
     patience : float
-        Time without a spike that passed the gate after which lock is lost, s.
+        Time without a spike that passed the gate after which lock is lost, s; longer than some
+        frames.
+    memory : float
+        How old a spike may be in the search for a pose, s. Three different LEDs or more must be
+        found in it, `FEW` spikes in all if they are not more than three.
     uncertainty : tuple of float
         Standard deviations of place, mm, and heading, rad, above which lock is lost: the next spike
         could be a reflection and still pass the gate. A pose that is found may have `ROUGH` times
@@ -234,6 +247,7 @@ class MotionFilter:
         led_error: float = 0.0,
         gate: float = 16.0,
         patience: float = 0.3,
+        memory: float = 0.25,
         uncertainty: tuple[float, float] = (50.0, 0.015),
         speed: float = 1000.0,
         turning: float = 1.5,
@@ -257,6 +271,9 @@ class MotionFilter:
         self._blur = check.not_negative("led_error", led_error, "mm") ** 2
         self._gate = check.positive("gate", gate)
         self._patience_ns = round(check.positive("patience", patience, "s") * 1e9)
+        self._memory_ns = round(check.positive("memory", memory, "s") * 1e9)
+        if np.shape(uncertainty) != (2,):
+            raise ValueError(f"uncertainty = {uncertainty!r}: two are needed, of place and heading")
         self._limits = tuple(check.positive("uncertainty", u) ** 2 for u in uncertainty)
         self._rates = (check.positive("speed", speed), check.positive("turning", turning))
         self._rows = {channel: row for row, channel in enumerate(leds.channels)}
@@ -265,19 +282,31 @@ class MotionFilter:
         ends = np.sort(camera.tangent([-BEYOND, _LAST + BEYOND]))
         self._lens = np.concatenate([camera.coefficients, ends])
         states = self._kernels.STATES
-        self._state = np.zeros(states)
+        self._state = self._unmoved()
         self._cov = np.zeros((states, states))
+        self._cov[7, 7] = bias.sigma**2
+        self._known = False  # any pose
+        # what there is to find out: pose, rates, height and its square, the last two in units of
+        # their uncertainty
+        doubt = height.sigma
+        self._basis = np.zeros((states, 8))
+        self._basis[:6, :6] = np.eye(6)
+        self._basis[6, 6] = doubt
+        self._basis[8, 6:] = 2 * height.value * doubt, SQUARED * math.sqrt(2) * doubt**2
+        self._prior = np.diag([0.0] * 3 + [speed**-2, speed**-2, turning**-2, 1.0, 1.0])
         self._row, self._column, self._result = np.zeros(states), np.zeros(states), np.zeros(3)
         self._t = 0
         self._seen: set[int] = set()
         self._used_ns = 0
         self._recent = 0  # a bit for each measurement, 1 if it was refused
         self._trusted: tuple[int, float, float, float] | None = None
-        self._mean_nis = 1.0
+        self._mean_nis = self._mean_turn = 1.0  # of spikes; of rates of the gyroscope
+        self._late: int | None = None  # time of the first one that was stale since any was not
         self._kept: deque[tuple[int, int, float, float]] = deque(maxlen=SPIKES)
         self._to_confirm = 0
         self._tries = 0
         self._flags = 0
+        self._doubts = 0  # a bit for each measurement, 1 if the pose was unchecked
         self._unchecked = False  # the pose: too few LEDs speak for it …
         self._witnesses: frozenset[int] = frozenset()  # … and these
         self._refused: set[int] = set()  # since any spike was believed
@@ -293,13 +322,13 @@ class MotionFilter:
 
     @property
     def state(self) -> NDArray[np.float64]:
-        """x, y, heading, their rates, height, bias at `t_ns`; mm, rad, s. A copy."""
+        """x, y, heading, their rates, height, bias, height squared at `t_ns`; mm, rad, s. A copy."""
         return self._state.copy()
 
     @property
     def covariance(self) -> NDArray[np.float64]:
-        """Of `state`, shape (8, 8). A copy."""
-        return self._cov.copy()
+        """Of `state`, shape (9, 9); infinite where no pose was ever known. A copy."""
+        return self._cov.copy() if self._known else np.diag(np.full(len(self._cov), math.inf))
 
     @property
     def unchecked(self) -> bool:
@@ -331,30 +360,46 @@ class MotionFilter:
         ):
             raise ValueError("fix: pose and covariance must be finite; were there enough spikes?")
         speed, turning = self._rates
-        self._begin(
-            t_ns,
-            [fix.x, fix.y, fix.heading, 0.0, 0.0, 0.0],
-            np.diag([0.0] * 3 + [speed**2, speed**2, turning**2]),
-        )
-        self._cov[:3, :3] = fix.covariance
+        state = self._unmoved()
+        state[:3] = fix.x, fix.y, fix.heading
+        covariance = np.diag([0.0] * 3 + [speed**2, speed**2, turning**2, 1.0, 1.0])
+        covariance[:3, :3] = fix.covariance
+        self._begin(t_ns, state, covariance)
         self._witnesses = frozenset(self._rows[channel] for channel in channels)
         self._lock(unchecked=bool(fix.flags & PoseFlags.UNCHECKED))
 
-    def _begin(self, t_ns: int, motion: Any, covariance: NDArray[np.float64]) -> None:
+    def _unmoved(self) -> NDArray[np.float64]:
+        """State before anything is known: height, its square and bias as they are likely to be."""
+        state = np.zeros(self._kernels.STATES)
+        height, doubt = self._height.value, self._height.sigma
+        state[6:] = height, self._bias.value, height**2 + doubt**2
+        return state
+
+    def _begin(
+        self, t_ns: int, state: NDArray[np.float64], covariance: NDArray[np.float64]
+    ) -> None:
+        """Take over a state but for its bias, and the covariance of multiples of `_basis`."""
+        bias, variance = self._bias.value, self._bias.sigma**2
+        if self._mean_turn <= INFLATED:
+            bias = self._state[7]
+            variance = max(self._cov[7, 7], min(4 * self._cov[7, 7], variance))
         self._t = int(t_ns)
         self._seen.clear()
-        self._state[:6] = motion
-        self._state[6:] = self._height.value, self._bias.value
-        self._cov[:] = 0.0
-        self._cov[:6, :6] = covariance
-        self._cov[6, 6], self._cov[7, 7] = self._height.sigma**2, self._bias.sigma**2
+        self._state[:] = state
+        self._state[7] = bias
+        self._cov[:] = self._basis @ covariance @ self._basis.T
+        self._cov += self._cov.T.copy()
+        self._cov *= 0.5
+        self._cov[7, 7] = variance
+        self._mean_turn = 1.0
+        self._known = True
 
     def _lock(self, *, unchecked: bool) -> None:
         self.lost = False
         self._unchecked = unchecked
         self._refused.clear()
         self._used_ns = self._t
-        self._recent = 0
+        self._recent = self._doubts = 0
         self._mean_nis = 1.0
         self._kept.clear()
         self._to_confirm = 0
@@ -367,6 +412,7 @@ class MotionFilter:
             self._t = int(t_ns)
             self._seen.clear()
             self._flags = 0
+            self._late = None
 
     def update(
         self, t_ns: int, channel: int, spike: Spike, gyro: tuple[float, float] | None = None
@@ -395,14 +441,15 @@ class MotionFilter:
         if row is None:
             self.leds.index(channel)  # says what is wrong
             raise AssertionError  # pragma: no cover
-        if t_ns < self._t or (t_ns == self._t and channel in self._seen):
-            self.stale += 1
-            return self._note(t_ns, channel, Outcome.STALE)
         if t_ns > self._t:
             self.predict(t_ns)
-        self._seen.add(channel)
         if gyro is not None:
-            self._turn(*gyro)
+            self._turn(t_ns, *gyro)
+        if t_ns < self._t or channel in self._seen:
+            self.stale += 1
+            self._doubt_clock(t_ns)
+            return self._note(t_ns, channel, Outcome.STALE)
+        self._seen.add(channel)
         flags = int(spike.flags)
         if flags & _MISSING:
             self._judge()
@@ -420,14 +467,17 @@ class MotionFilter:
         outcome = _OUTCOMES[self._measure(row, spike.position, variance)]
         predicted, residual, scale = self._result.tolist()
         self._recent = self._recent << 1 & _HISTORY
+        self._doubts = (self._doubts << 1 | self._unchecked) & _HISTORY
         if outcome is Outcome.USED:
             self._used_ns = self._t
-            self._believe(row, scale - variance > DOUBT**2)
+            self._believe(row, scale - variance)
             if not self._recent and not self._unchecked:
                 self._trusted = (self._t, *self._state[:3].tolist())
         else:
             self._recent |= 1
             self._refused.add(row)
+            if self._doubts and not self._unchecked:  # what agreed may have been the reflection
+                self._unchecked, self._witnesses = True, frozenset()
             self._flags |= _REJECTED
         if outcome is not Outcome.UNSEEN:
             nis = min(residual * residual / scale, self._gate)
@@ -457,8 +507,10 @@ class MotionFilter:
             gyro = None
         if not spikes:
             self.predict(t_ns)
-            if gyro is not None and t_ns == self._t:
-                self._turn(*gyro)
+            if gyro is not None:
+                self._turn(t_ns, *gyro)
+            if t_ns < self._t:
+                self._doubt_clock(t_ns)
             self._judge()
         return self.estimate()
 
@@ -480,11 +532,12 @@ class MotionFilter:
         flags |= _LOST if self.lost else _UNCHECKED * self._unchecked
         if t_ns > self._used_ns:
             flags |= _PREDICTED
-        if self._mean_nis > INFLATED:
+        if self._mean_nis > INFLATED or self._mean_turn > INFLATED:
             flags |= _INCONSISTENT
         x, y, heading = state[:3].tolist()
         heading = math.remainder(heading, math.tau)
-        return Estimate(t_ns, x, y, heading, cov[:3, :3].copy(), _FLAGS[flags])
+        covariance = cov[:3, :3].copy() if self._known else np.diag([math.inf] * 3)
+        return Estimate(t_ns, x, y, heading, covariance, _FLAGS[flags])
 
     def expected(self, t_ns: int | None = None) -> Expected:
         """Tell where the spikes of all LEDs should be: for windows, and for what to light.
@@ -508,6 +561,8 @@ class MotionFilter:
             sigmas,
             visible,
         )
+        if not self._known:
+            pixels[:], sigmas[:], visible[:] = math.nan, math.inf, False
         return Expected(self.leds.channels, pixels, sigmas, visible)
 
     def choose(
@@ -580,12 +635,17 @@ class MotionFilter:
         )
         return outcome
 
-    def _turn(self, rate: float, sigma: float) -> None:
+    def _turn(self, t_ns: int, rate: float, sigma: float) -> None:
+        """Take in a rate of the gyroscope, one for each time."""
+        check.number("rate of the gyroscope", rate, "rad/s")
         variance = check.positive("sigma of the gyroscope", sigma, "rad/s") ** 2
+        if t_ns < self._t or _GYRO in self._seen or not self._known:
+            return
+        self._seen.add(_GYRO)
         outcome = self._kernels.turn(
             self._state,
             self._cov,
-            check.number("rate of the gyroscope", rate, "rad/s"),
+            rate,
             variance,
             self._gate,
             self._row,
@@ -593,7 +653,11 @@ class MotionFilter:
             self._result,
         )
         predicted, residual, scale = self._result.tolist()
-        self._note(self._t, -1, Outcome(outcome), predicted, residual, math.sqrt(scale))
+        if not self.lost:
+            nis = min(residual * residual / scale, self._gate)
+            self._mean_turn += SHARE * (nis - self._mean_turn)
+            self._flags |= _REJECTED * (outcome != Outcome.USED)
+        self._note(self._t, _GYRO, _OUTCOMES[outcome], predicted, residual, math.sqrt(scale))
 
     def _note(
         self,
@@ -608,15 +672,30 @@ class MotionFilter:
         self.innovations.append(innovation)
         return innovation
 
-    def _believe(self, row: int, doubtful: bool) -> None:
-        """Find out whether a spike that passed the gate speaks for the pose, or was easy to please."""
-        if doubtful or row in self._refused:
+    def _believe(self, row: int, doubt: float) -> None:
+        """Find out whether a spike that passed the gate speaks for the pose, or was easy to please.
+
+        Doubt is the variance of its prediction, px². Nothing is cleared by a spike of which nearly
+        as little was known as of the doubtful one, nor as long as others are refused.
+        """
+        if doubt > DOUBT**2 or row in self._refused:
             if not self._unchecked:
                 self._unchecked, self._witnesses = True, frozenset([row])
             return
+        if self._unchecked and (row in self._witnesses or doubt > (DOUBT / 2) ** 2 or self._recent):
+            return
         self._refused.clear()
-        if row not in self._witnesses:
-            self._unchecked = False
+        self._unchecked = False
+
+    def _doubt_clock(self, t_ns: int) -> None:
+        """Find out from a measurement that is stale whether the clock was set back."""
+        if self._late is None:
+            self._late = t_ns
+        if t_ns - self._late > self._patience_ns:
+            self._lose()
+            self._t, self._late = int(t_ns), None
+            self._known, self._trusted = False, None
+            self._seen.clear()
 
     def _judge(self) -> None:
         """Find out whether lock is lost."""
@@ -631,10 +710,13 @@ class MotionFilter:
             or cov.item(1, 1) > place
             or cov.item(2, 2) > heading
         ):
-            self.lost = True
-            self.losses += 1
-            self._kept.clear()
-            self._to_confirm = 0
+            self._lose()
+
+    def _lose(self) -> None:
+        self.losses += not self.lost
+        self.lost = True
+        self._kept.clear()
+        self._to_confirm = 0
 
     def _search(
         self, t_ns: int, channel: int, row: int, pixel: float, variance: float
@@ -662,13 +744,14 @@ class MotionFilter:
 
     def _relocalise(self) -> bool:
         """Seek a pose in the spikes kept; the filter begins there."""
-        while self._t - self._kept[0][0] > MEMORY_NS:
+        while self._t - self._kept[0][0] > self._memory_ns:
             self._kept.popleft()
         rows = [row for _, row, _, _ in self._kept]
         different = len(set(rows))
         # three LEDs fit some pose, whatever they say: better with more, or near the last pose
-        fewest = 4 if different > 3 else 20 if self._trusted is None else 7
-        if different < 3 or len(rows) < fewest:
+        waited = self._trusted is not None or 2 * (self._t - self._kept[0][0]) >= self._memory_ns
+        fewest = 4 if different > NEEDED else FEW if waited else SURE
+        if different < NEEDED or len(rows) < fewest:
             return False
         kept = np.array(self._kept)
         ages = np.array([(t - self._t) * 1e-9 for t, *_ in self._kept])
@@ -695,8 +778,7 @@ class MotionFilter:
         variances: NDArray[np.float64],
     ) -> bool:
         """Fit a straight path at constant rates, leaving single LEDs out where it does not fit."""
-        speed, turning = self._rates
-        prior = np.diag([0.0, 0.0, 0.0, speed**-2, speed**-2, turning**-2])
+        turning = self._rates[1]
         scale = abs(self.camera.scale)
         # what acceleration adds, seen from a metre or more
         linear, angular = self._density[:2]
@@ -725,14 +807,13 @@ class MotionFilter:
                 continue
             if not np.isfinite(fix.covariance).all() or fix.flags & PoseFlags.AMBIGUOUS:
                 continue  # too few LEDs, or too near to each other
-            state = np.zeros(self._kernels.STATES)
+            state = self._unmoved()
             state[:3] = fix.x, fix.y, fix.heading
-            state[6] = self._height.value
-            information = np.zeros((6, 6))
+            information = np.zeros_like(self._prior)
             chi2 = self._kernels.fit(
                 state,
-                prior,
-                self._height.sigma**2,
+                self._basis,
+                self._prior,
                 ages[use],
                 rows[use],
                 pixels[use],
@@ -750,7 +831,7 @@ class MotionFilter:
                 continue
             if different < MANY and not self._reachable(state):
                 continue
-            self._begin(self._t, state[:6], covariance)
+            self._begin(self._t, state, covariance)
             self._seen = {int(rows[-1])}
             self._witnesses = frozenset(rows[use].tolist())
             return True

@@ -82,23 +82,20 @@ class LineWriter:
     line : callable
         `as_text`, `as_json` or `as_csv`.
     header : str
-        Written first, unless empty.
+        Written before the first pose, unless empty: without a pose, nothing is.
     """
 
     def __init__(
         self, stream: TextIO, line: Callable[[Estimate], str] = as_text, header: str = ""
     ) -> None:
         self._stream, self._line = stream, line
-        if header:
-            self._put(header)
+        self._before = f"{header}\n" if header else ""
 
     def __call__(self, estimate: Estimate) -> None:
         """Write a pose."""
-        self._put(self._line(estimate))
-
-    def _put(self, text: str) -> None:
-        self._stream.write(text + "\n")
+        self._stream.write(f"{self._before}{self._line(estimate)}\n")
         self._stream.flush()
+        self._before = ""
 
     def complaint(self) -> str:
         """Say nothing: a stream that does not take a line raises."""

@@ -32,6 +32,9 @@ _MISSING, _SATURATED = int(SpikeFlags.MISSING), int(SpikeFlags.SATURATED)
 FORGETTING = 1.0
 """Time after which little is left of what was learnt of an LED, s."""
 
+ROUNDS = 4
+"""Times that each LED is lit in a frame of its own for which what was learnt lasts at least."""
+
 DOUBTFUL = 0.5
 """By how much a spike that was not found lowers the chance that the next one is."""
 LOWEST = 0.02
@@ -148,6 +151,36 @@ class ExposureControl:
         self._gains[row] = gain
         self._learnt[row] = seconds
 
+    def restart(self) -> None:
+        """Forget when what was learnt was learnt: another clock begins. The LEDs' mean gain stays."""
+        self._learnt[:] = -math.inf
+
+
+class _Blind:
+    """Exposures before there was any pose: long, medium and short ones until an LED is found."""
+
+    def __init__(self, count: int, sh_period: int, peak: float) -> None:
+        self._levels = sh_period * np.array([1.0, 0.25, 0.0625])
+        self._tries = np.zeros(count, np.int64)
+        self._known = np.full(count, math.nan)  # what an LED found needs
+        self._peak = peak
+
+    def clocks(self) -> NDArray[np.float64]:
+        """Master clocks of each LED."""
+        tried = self._levels[self._tries % len(self._levels)]
+        return np.where(np.isnan(self._known), tried, self._known)
+
+    def learn(self, row: int, clocks: int, spike: Spike) -> None:
+        """Take in what an LED lit for so many clocks gave."""
+        flags = int(spike.flags)
+        if flags & _MISSING:
+            was_found = not math.isnan(self._known.item(row))
+            self._tries[row] = 0 if was_found else self._tries.item(row) + 1
+            self._known[row] = math.nan
+        else:
+            change = 0.25 if flags & _SATURATED else self._peak / max(spike.height, 1.0)
+            self._known[row] = clocks * change
+
 
 class Schedule:
     """Plans which LEDs are lit in the frames to come.
@@ -202,9 +235,12 @@ class Schedule:
         self.apart = check.positive("apart", apart, "px")
         self.sigma = check.positive("sigma", sigma, "px")
         self.period_ns = icg_period * 1_000_000_000 // master_clock
+        # of what was learnt in a few rounds something must be left, however slow the frames are
+        self._forgetting = max(FORGETTING, ROUNDS * len(leds) * self.period_ns * 1e-9)
         self._kernels = load_kernels()
         self._chances = np.ones(len(leds))
         self._judged = np.full(len(leds), -math.inf)  # when, s
+        self._blind = _Blind(len(leds), sh_period, self.exposure.peak)
         self._lit = np.zeros(len(leds), np.int64)  # turn in which it was lit last
         self._turn = 0
         self._rows = {channel: row for row, channel in enumerate(leds.channels)}
@@ -244,7 +280,9 @@ class Schedule:
         self._fluxes = self.exposure.fluxes(x, y, seconds)
         clocks = self.exposure.clocks(self._fluxes)
         if motion.lost:
-            clocks = self._blind(clocks) if not motion.losses else clocks
+            if not motion.losses:  # nobody knows how far away they are
+                self._fluxes = np.zeros(len(self.leds))
+                clocks = self._blind.clocks()
             plan = self._search(motion, start, frames)
         else:
             plan = self._plan(motion, start, frames, clocks)
@@ -273,36 +311,43 @@ class Schedule:
         for channel, spike in spikes.items():
             row = self._rows[channel]
             self.exposure.learn(channel, lit[channel], spike, self._fluxes.item(row), seconds)
+            self._blind.learn(row, lit[channel], spike)
             if not int(spike.flags) & _MISSING:
                 self._chances[row] = 1.0
             else:
-                left = math.exp(min(self._judged.item(row) - seconds, 0.0) / FORGETTING)
+                left = math.exp(min(self._judged.item(row) - seconds, 0.0) / self._forgetting)
                 chance = 1.0 - (1.0 - self._chances.item(row)) * left
                 self._chances[row] = max(DOUBTFUL * chance, LOWEST)
             self._judged[row] = seconds
 
     def chances(self, seconds: float) -> NDArray[np.float64]:
         """Chance of each LED to be found where it should be seen, from whether it was lately."""
-        left = self._kernels.fading(self._judged, seconds, FORGETTING)
+        left = self._kernels.fading(self._judged, seconds, self._forgetting)
         return np.asarray(1.0 - (1.0 - self._chances) * left)
+
+    def restart(self) -> None:
+        """Forget which LEDs were found, and when: another clock begins."""
+        self._chances[:] = 1.0
+        self._judged[:] = -math.inf
+        self._blind = _Blind(len(self.leds), self.sh_period, self.exposure.peak)
+        self.exposure.restart()
 
     def _plan(
         self, motion: MotionFilter, start: int, frames: int, clocks: NDArray[np.float64]
     ) -> list[NDArray[np.int64]]:
         raise NotImplementedError
 
-    def _blind(self, clocks: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Exposures before there was any pose: long, medium and short ones, in turns."""
-        levels = self.sh_period * np.array([1.0, 0.25, 0.0625])
-        number = self._turn // len(self.leds)
-        return np.full_like(clocks, max(levels[number % 3], EXPOSURE_MIN))
-
     def _search(self, motion: MotionFilter, start: int, frames: int) -> list[NDArray[np.int64]]:
-        """One LED a frame while lock is lost: those that waited long, rather where they are seen."""
-        expected = motion.expected(max(start, motion.t_ns))
+        """One LED a frame while lock is lost: those that waited long, rather if they may be seen.
+
+        That is those found lately; where there was a pose, those that it says are in view; else
+        those not tried yet.
+        """
         seconds = start * 1e-9
-        weight = np.ones(len(self.leds))
-        if motion.losses:
+        if not motion.losses:
+            likely = np.where(np.isinf(self._judged), 1.0, ELSEWHERE)
+        else:
+            expected = motion.expected(max(start, motion.t_ns))
             likely = np.array(
                 [
                     self._kernels.inside(pixel, sigma**2, float(LAST))
@@ -312,8 +357,8 @@ class Schedule:
                 ]
             )
             likely *= self._fluxes > 0
-            found = (self._chances == 1.0) & (seconds - self._judged < FORGETTING / 2)
-            weight = np.where(found, 1.0, np.maximum(likely, ELSEWHERE) * self.chances(seconds))
+        found = (self._chances == 1.0) & (seconds - self._judged < self._forgetting / 2)
+        weight = np.where(found, 1.0, np.maximum(likely, ELSEWHERE) * self.chances(seconds))
         lit = self._lit.copy()
         plan = []
         for number in range(1, frames + 1):
@@ -353,14 +398,18 @@ class PredictedVisible(Schedule):
         if not weight.any():
             return self._search(motion, start, frames)
         lit = self._lit.copy()
+        pixels, sigmas = expected.pixels.tolist(), expected.sigmas.tolist()
         plan = []
         for number in range(1, frames + 1):
             rows: list[int] = []
             for row in np.argsort(-weight * (self._turn + number - lit)).tolist():
                 if len(rows) == self.per_frame or not weight[row]:
                     break
-                reach = self.apart + 3 * (expected.sigmas[row] + expected.sigmas[rows])
-                if (np.abs(expected.pixels[row] - expected.pixels[rows]) > reach).all():
+                if all(
+                    abs(pixels[row] - pixels[other])
+                    > self.apart + 3 * (sigmas[row] + sigmas[other])
+                    for other in rows
+                ):
                     rows.append(row)
             lit[rows] = self._turn + number
             plan.append(np.array(rows))

@@ -15,9 +15,9 @@ from __future__ import annotations
 
 import gc
 import math
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import replace
-from itertools import pairwise
+from itertools import islice, pairwise
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
@@ -26,7 +26,10 @@ from acquisition.capture import Capture
 from acquisition.frames import ELEMENTS, MASTER_CLOCK, Frame, FrameFlags
 from acquisition.protocol import BRIEF_TABLE_MAX, ICG_MIN, WINDOW_MIN, Command, Mode
 from raytransfer import TCD1304
-from tracking.motion import MEMORY_NS, Innovation, MotionFilter, Outcome
+from raytransfer import _checks as check
+from tracking.camera import Camera
+from tracking.leds import LedMap
+from tracking.motion import Innovation, MotionFilter, Outcome
 from tracking.poses import Estimate, PoseFlags, Prior, locate, optical
 from tracking.scheduling import ExposureControl, PredictedVisible
 from tracking.spikes import MISSING, Spike, SpikeFinder, SpikeFlags
@@ -37,7 +40,6 @@ if TYPE_CHECKING:
     from acquisition.frames import OnboardSpike, SpikeFrame
     from acquisition.links import Link
     from tracking.calibration import Calibration
-    from tracking.leds import LedMap
     from tracking.motion import Expected
     from tracking.scheduling import Schedule
     from tracking.spikes import Detector
@@ -60,11 +62,25 @@ PEAK: Final = 30_000.0
 UNLIT_EVERY: Final = 20
 """Frames from one without light to the next, if nothing else is said: 5 % of them."""
 
+LATE: Final = 8
+"""Frames by which one may come late; what is earlier is of another recording or another start."""
+
+BRISK_NS: Final = 10_000_000
+"""Period from frame to frame up to which times that the filter waits are the same, ns. With longer
+ones they are as many frames, and it may be as uncertain as motion makes it in them: white
+acceleration by their power of 3/2."""
+
+SLOWEST: Final = {True: 0.1, False: 0.05}
+"""Longest period from frame to frame with the heading known, or not, s: beyond, so much may happen
+between two frames that no pose would hold."""
+
 END: Final = 60.0
 """Pixels at the ends of the line where part of a spike's light may be beyond it."""
 
 _SPEED = 1000.0  # mm/s; what is not known better
 _TURNING = 1.5  # rad/s
+_MEMORY, _PATIENCE = 0.25, 0.3  # s
+_UNCERTAINTY = 50.0, 0.015  # mm, rad
 _STROLL = 300.0  # mm/s; while two LEDs are seen one after the other
 _WIDTH = 40.0  # px of a spike that was not seen yet
 _REACH = 1.5  # widths that a spike's light reaches to either side
@@ -119,14 +135,15 @@ class Tracker:
         Of the tracker, mm.
     detector : {"minimum", "gravity", "derivative", "likelihood"}
     schedule : Schedule, optional
-        What to light. Left out, a `PredictedVisible` of up to three LEDs a frame, with an SH period
-        of 100 clocks and the shortest ICG period.
+        What to light, of the calibration's LEDs. Left out, a `PredictedVisible` of up to three LEDs
+        a frame, with an SH period of 100 clocks and the shortest ICG period.
     unlit_every : int
         Frames from one in which no LED is lit to the next; 0 is never. What shines in it, a lamp, a
         window, is subtracted where an LED is sought, as long as it stays in its place on the line.
         Not in spikes mode, in which nothing can be subtracted.
     **motion
-        Further options of `MotionFilter`.
+        Further options of `MotionFilter`. Its memory, patience and uncertainty follow from the
+        frames' period when left out.
 
     Attributes
     ----------
@@ -137,7 +154,7 @@ class Tracker:
     ------
     ValueError
         There are too few LEDs, or a heading that is neither known nor open; unlit_every is below 0
-        or 1.
+        or 1; the schedule is of another map, or its frames are further apart than `SLOWEST`.
     """
 
     def __init__(
@@ -163,10 +180,18 @@ class Tracker:
             )
         if heading.sigma and len(leds) == 2:
             raise ValueError("two LEDs do not tell the heading: give one, or a map of three")
+        check.number("value of heading", heading.value, "rad")
         if unlit_every < 0 or unlit_every == 1:
             raise ValueError(
                 f"unlit_every = {unlit_every}: allowed are 2 and more frames, or 0 for never"
             )
+        schedule = default_schedule(leds) if schedule is None else schedule
+        if schedule.leds != leds:
+            raise ValueError(
+                f"the schedule lights LEDs {', '.join(map(str, schedule.leds.channels))} of a map "
+                "that is not the calibration's: were places or channels changed?"
+            )
+        self.schedule = schedule
         self._unlit_every = unlit_every
         self._since_unlit = unlit_every  # frames
         self._unlit: Frame | None = None  # the newest
@@ -179,13 +204,15 @@ class Tracker:
         options = {"speed": _SPEED, "turning": _TURNING, **(still if self._heading else {})}
         if calibration.covariance is None:
             options["led_error"] = PLACED
-        self._motion = {"height": height, **options, **motion}
-        self._restart()
+        self._height, self._options = height, {**options, **motion}
+        self._losses = 0  # of filters before this one
+        self._begin(schedule.period_ns)
         self._finder = SpikeFinder(calibration.correction, detector=detector)
         self._warm()
-        self.schedule = default_schedule(leds) if schedule is None else schedule
         self._widths = dict.fromkeys(leds.channels, _WIDTH)
         self._t_ns: int | None = None
+        self._sequence = 0  # number of the newest frame
+        self._known = False  # whether there was ever a pose
         self._told: set[int] = set()  # LEDs of which the schedule has heard since its last plan
         self._left = 0  # frames until a new sequence is due
 
@@ -197,25 +224,29 @@ class Tracker:
     @property
     def losses(self) -> int:
         """How often lock was lost."""
-        return self._filter.losses
+        return self._losses + self._filter.losses
 
     def update(self, frame: Frame | SpikeFrame) -> Estimate | None:
         """Take a frame in, and return the pose at the end of its exposure.
 
+        Where the device's clock runs back, everything begins anew.
+
         Parameters
         ----------
         frame : Frame or SpikeFrame
-            One with `FrameFlags.INVALID` is not measured on.
+            One with `FrameFlags.INVALID` is not measured on. One that comes late or twice changes
+            nothing.
 
         Returns
         -------
         Estimate or None
-            None as long as no pose has ever been known.
+            None as long as no pose has ever been known, and for what comes late or twice.
 
         Raises
         ------
         ValueError
-            It was lit by an LED that the map does not have.
+            It was lit by an LED that the map does not have, or comes from a recording whose frames
+            are further apart than `SLOWEST`.
         """
         if unknown := [n for n in frame.channels if n not in self._widths]:
             raise ValueError(
@@ -223,6 +254,13 @@ class Tracker:
                 f"{', '.join(map(str, self.leds.channels))}: is it that of another room?"
             )
         t_ns = self._time(frame)
+        if self._stale(frame, t_ns):
+            self.innovations = tuple(
+                Innovation(t_ns, n, math.nan, math.nan, math.inf, Outcome.STALE)
+                for n in frame.channels
+            )
+            return None
+        self._follow_clock(frame, t_ns)
         lost = self._filter.lost
         spikes: dict[int, Spike] = {}
         self._since_unlit += 1
@@ -260,9 +298,9 @@ class Tracker:
 
     def step(self, frame: Frame | SpikeFrame) -> Step:
         """As `update`, with what it was based on."""
+        t_ns = self._time(frame)
         estimate = self.update(frame)
-        assert self._t_ns is not None  # noqa: S101  # set by update
-        return Step(frame, self._t_ns, estimate, self.innovations)
+        return Step(frame, t_ns, estimate, self.innovations)
 
     def sequence(self, *, spikes: bool = False) -> list[dict[int, int]] | None:
         """What to light in the next frames: exposure in master clocks by channel, frame by frame.
@@ -322,27 +360,20 @@ class Tracker:
         codes[2000:2010] = 3000
         self._finder(Frame(codes))
         self._finder(Frame(codes), windows=[(1900, 2000)], unlit=Frame(codes))
-        camera, leds = self.calibration.camera, self.leds
-        x, y = leds.positions[:, 0].mean(), leds.positions[:, 1].max() + 3000.0
-        points = optical(leds.positions, x, y, 0.0, self._motion["height"].value)
+        # a camera and a room in which a pose is found, whatever those of the user are
+        camera, leds = (
+            Camera(3500.0, (TCD1304.pixels - 1) / 2, (0.02,)),
+            LedMap.line(9, 200.0, 300.0),
+        )
+        points = optical(leds.positions, 0.0, 3000.0, 0.0, 0.0)
         pixels = camera.project(points)
-        seen = [n for n, s in zip(leds.channels, camera.sees(points), strict=True) if s]
-        motion = MotionFilter(camera, leds, **self._motion)
+        motion = MotionFilter(camera, leds, height=Prior(0.0, min(self._height.sigma, 1.0)))
         plan = default_schedule(leds)
-        with suppress(ValueError):  # an odd map: it may have no pose there
-            for number in range(4 * len(leds)):
-                at = leds.index(seen[number % len(seen)])
-                spike = Spike(float(pixels[at]), 0.1, 10.0, 1e4)
-                motion.update(number * plan.period_ns, leds.channels[at], spike)
-            places = [leds.index(n) for n in seen]
-            known = Prior(0.0, 0.0)
-            locate(
-                camera,
-                leds.positions[places],
-                pixels[places],
-                0.1 + 0 * pixels[places],
-                heading=known,
-            )
+        for number in range(4 * len(leds)):
+            row = number % len(leds)
+            spike = Spike(float(pixels[row]), 0.1, 10.0, 1e4)
+            motion.update(number * plan.period_ns, leds.channels[row], spike)
+        locate(camera, leds.positions, pixels, 0.1, heading=Prior(0.0, 0.0))
         for lost in (False, True):
             motion.lost, motion.losses = lost, 1
             plan.sequence(motion, motion.t_ns, AHEAD)
@@ -350,24 +381,60 @@ class Tracker:
             motion.expected(motion.t_ns + 1)
         gc.collect()  # compiling leaves much behind: clear it away now, not between two frames
 
-    def _restart(self) -> None:
-        self._filter = MotionFilter(self.calibration.camera, self.leds, **self._motion)
+    def _begin(self, period_ns: int) -> None:
+        """Know of no pose, and that frames come with this period."""
+        known = self._heading is not None
+        slowest = SLOWEST[known]
+        if period_ns > slowest * 1e9:
+            raise ValueError(
+                f"a frame every {period_ns * 1e-9:g} s, heading {'' if known else 'not '}known: "
+                f"allowed is up to {slowest:g} s, an ICG period of {slowest * MASTER_CLOCK:.0f} clocks"
+            )
+        self._period_ns = period_ns
+        options = self._pace() | self._options
+        self._memory_ns = round(options["memory"] * 1e9)
+        self._filter = MotionFilter(
+            self.calibration.camera, self.leds, height=self._height, **options
+        )
         self._seen: dict[int, tuple[int, Spike]] = {}  # latest, while lock is lost
         self._last: Estimate | None = None  # that was known
         self._fresh = PoseFlags.NONE  # of a pose just found
         self._unlit, self._lamps = None, []
 
+    def _pace(self) -> dict[str, Any]:
+        """Limits of the filter, as many frames away as with `BRISK_NS`."""
+        slow = max(self._period_ns / BRISK_NS, 1.0)
+        place, heading = _UNCERTAINTY
+        return {
+            "memory": slow * _MEMORY,
+            "patience": slow * _PATIENCE,
+            "uncertainty": (slow**1.5 * place, slow**1.5 * heading),
+        }
+
     def _time(self, frame: Frame | SpikeFrame) -> int:
         """End of the exposure, ns; of frames without a time, one read-out after the other."""
-        before = self._t_ns
         if frame.timestamp is not None:
-            self._t_ns = frame.timestamp
-        else:
-            clocks = frame.icg_period or ICG_MIN
-            self._t_ns = (before or 0) + round(clocks / frame.master_clock * 1e9)
-        if before is not None and self._t_ns < before:
-            self._restart()  # another recording
-        return self._t_ns
+            return frame.timestamp
+        clocks = frame.icg_period or ICG_MIN
+        return (self._t_ns or 0) + round(clocks / frame.master_clock * 1e9)
+
+    def _stale(self, frame: Frame | SpikeFrame, t_ns: int) -> bool:
+        """Whether a frame comes late or twice: its number has gone back by as much as its time."""
+        if self._t_ns is None or t_ns > self._t_ns:
+            return False
+        behind = (self._t_ns - t_ns) / self._period_ns
+        return behind < LATE and abs(self._sequence - frame.sequence - behind) < 0.5
+
+    def _follow_clock(self, frame: Frame | SpikeFrame, t_ns: int) -> None:
+        """Begin anew with another clock, and with the period that the frames really have."""
+        back = self._t_ns is not None and t_ns < self._t_ns
+        if back:  # another recording, or the device began anew
+            self._losses += self._filter.losses + (not self._filter.lost)
+            self.schedule.restart()
+        if back or self._t_ns is None:
+            period_ns = round(frame.icg_period / frame.master_clock * 1e9)
+            self._begin(period_ns or self._period_ns)
+        self._t_ns, self._sequence = t_ns, frame.sequence
 
     def _sought(self, frame: Frame | SpikeFrame) -> dict[int, Spike]:
         """Spikes of the whole line: the strongest, as many as LEDs are lit.
@@ -458,28 +525,25 @@ class Tracker:
 
     def _lit_windows(self, lit: Collection[int], expected: Expected) -> dict[int, tuple[int, int]]:
         """First and last pixel by channel; LEDs that cannot be told apart are left out."""
-        pixels, sigmas = expected.pixels, expected.sigmas
+        channels, pixels, sigmas = expected.channels, expected.pixels, expected.sigmas
         rows = [row for row in map(self.leds.index, lit) if expected.visible[row]]
         rows.sort(key=pixels.__getitem__)
-        widths = [self._widths[self.leds.channels[row]] for row in rows]
-        reach = [
-            _REACH * w + _MARGIN + 5 * sigmas[row] for w, row in zip(widths, rows, strict=True)
-        ]
-        low = [pixels[row] - r for row, r in zip(rows, reach, strict=True)]
-        high = [pixels[row] + r for row, r in zip(rows, reach, strict=True)]
+        widths = [self._widths[channels[row]] for row in rows]
+        windows = {
+            channels[row]: expected.window(channels[row], _REACH * width + _MARGIN)
+            for row, width in zip(rows, widths, strict=True)
+        }
         mixed = set()
         for (i, row), (j, other) in pairwise(enumerate(rows)):
+            one, next_one = channels[row], channels[other]
             gap = pixels[other] - pixels[row]
             if gap < _APART * (widths[i] + widths[j]) + 3 * (sigmas[row] + sigmas[other]):
-                mixed |= {i, j}
+                mixed |= {one, next_one}
             border = (pixels[row] + pixels[other]) / 2
-            high[i], low[j] = min(high[i], border), max(low[j], border)
-        last = TCD1304.pixels - 1
-        return {
-            self.leds.channels[row]: (max(math.floor(low[i]), 0), min(math.ceil(high[i]), last))
-            for i, row in enumerate(rows)
-            if i not in mixed
-        }
+            (low, high), (next_low, next_high) = windows[one], windows[next_one]
+            windows[one] = low, min(high, math.ceil(border))
+            windows[next_one] = max(next_low, math.floor(border)), next_high
+        return {channel: places for channel, places in windows.items() if channel not in mixed}
 
     @property
     def _unevenness(self) -> float:
@@ -496,7 +560,7 @@ class Tracker:
     def _fix(self, t_ns: int) -> None:
         """Seek a pose of known heading in the latest spike of each LED."""
         assert self._heading is not None  # noqa: S101  # as the caller has asked
-        recent = {n: kept for n, kept in self._seen.items() if t_ns - kept[0] <= MEMORY_NS}
+        recent = {n: kept for n, kept in self._seen.items() if t_ns - kept[0] <= self._memory_ns}
         if len(recent) < 2:
             return
         camera = self.calibration.camera
@@ -516,7 +580,7 @@ class Tracker:
                 np.array([spike.position for _, spike in recent.values()]),
                 np.sqrt(sigmas**2 + (3 * camera.model_error) ** 2 + (smear * ages) ** 2),
                 heading=self._heading,
-                height=self._motion["height"],
+                height=self._height,
                 facings=self.leds.facings[rows],
             )
         except ValueError:  # no pose has the LEDs in front, and shining toward it
@@ -527,9 +591,8 @@ class Tracker:
         if fix.degrees > 0 and fix.chi2 > limit:
             return
         self._filter.start(fix, t_ns, recent)
-        self._fresh = (
-            fix.flags & ~PoseFlags.UNCHECKED
-        )  # which the filter keeps, as long as it is so
+        # the filter keeps UNCHECKED, as long as it is so
+        self._fresh = fix.flags & ~PoseFlags.UNCHECKED
 
     def _estimate(self, t_ns: int, *, lost: bool) -> Estimate | None:
         """The pose at the end of a frame, in which lock was lost at its beginning or not."""
@@ -550,8 +613,9 @@ class Tracker:
         self._fresh = PoseFlags.NONE
         if Outcome.REJECTED in outcomes:
             flags |= PoseFlags.REJECTED
-        if lost and self._last is not None:
+        if lost and self._known:
             flags |= PoseFlags.RELOCALISED
+        self._known = True
         if not lost and Outcome.USED not in outcomes:
             flags |= PoseFlags.PREDICTED
         now = replace(self._filter.estimate(max(t_ns, self._filter.t_ns)), flags=flags)
@@ -655,14 +719,16 @@ def follow(capture: Capture, tracker: Tracker, *, steer: bool = True) -> Generat
 def track(
     link: Link, calibration: Calibration, *, count: int = 0, spikes: bool = False, **options: Any
 ) -> Iterator[Estimate]:
-    """Yield a pose for each frame from a link, once the first one is known.
+    """Yield poses: one for each frame from a link, once the first is known.
 
     Parameters
     ----------
     link : Link
         Stays open. A recording is followed with the LEDs that it was made with.
     calibration : Calibration
-    count, spikes
+    count : int
+        Poses; 0 is without end.
+    spikes : bool
         As for `first_command`.
     **options
         As for `Tracker`.
@@ -672,9 +738,8 @@ def track(
     Estimate
     """
     tracker = Tracker(calibration, **options)
-    command = first_command(tracker, count=count, spikes=spikes)
+    command = first_command(tracker, spikes=spikes)
     steer = not hasattr(link, "recorded")
     with Capture(link, command) as capture, closing(follow(capture, tracker, steer=steer)) as steps:
-        for step in steps:
-            if step.estimate is not None:
-                yield step.estimate
+        poses = (step.estimate for step in steps if step.estimate is not None)
+        yield from islice(poses, count or None)

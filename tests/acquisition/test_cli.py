@@ -738,3 +738,28 @@ def test_flags_are_kept_through_a_session(run: Callable[..., Result]) -> None:
     result = run("info", "flags.h5")
     assert result.code == cli.DOUBTFUL
     assert re.search(r"invalid +1 frame", result.out)
+
+
+def test_ctrl_c_while_it_is_imported(tmp_path: Path) -> None:
+    (tmp_path / "typer.py").write_text("raise KeyboardInterrupt")
+    result = subprocess.run(
+        [sys.executable, "-m", "acquisition"],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(Path.cwd())])},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (result.returncode, result.stdout, result.stderr) == (cli.INTERRUPTED, "", "")
+
+
+def test_ctrl_c_before_a_command_is_known(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "app", interrupted)
+    with pytest.raises(SystemExit) as ended:
+        cli.main([])
+    assert ended.value.code == cli.INTERRUPTED
+    assert capfd.readouterr() == ("", "")

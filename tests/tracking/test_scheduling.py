@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from acquisition.protocol import CHAIN_FIRST, CHAIN_STEP, EXPOSURE_MIN, Command, Mode
-from tests.tracking.endurance import ICG_PERIOD, SH_PERIOD, follow, head, led_map, room
+from tests.tracking.endurance import ICG_PERIOD, SH_PERIOD, Run, head, led_map, room
+from tracking.calibration import Calibration
 from tracking.camera import Camera
 from tracking.leds import LedMap
 from tracking.motion import MotionFilter
@@ -19,6 +20,7 @@ from tracking.scheduling import (
     allowed,
 )
 from tracking.spikes import Spike, SpikeFlags
+from tracking.tracker import Tracker
 from twin.spikes import Faults, SpikeWorld, Wander
 
 CAMERA = Camera(4244.0, 1823.5, (-0.42, 0.2))
@@ -38,6 +40,10 @@ def at(pose: Any, leds: Any = ROOM, sigmas: Any = (1.0, 1.0, 1e-3)) -> Any:
 
 def spike(height: Any = 16_000.0, flags: Any = SpikeFlags.NONE) -> Any:
     return Spike(1800.0, 0.05, 10.0, height, flags)
+
+
+def missing() -> Any:
+    return Spike(math.nan, math.inf, math.nan, math.nan, SpikeFlags.MISSING)
 
 
 # -- what the firmware takes
@@ -121,9 +127,8 @@ def test_an_led_that_is_not_found_waits_and_comes_back() -> None:
     motion = at((500.0, -200.0, 0.7))
     schedule = Greedy(ROOM, SH_PERIOD, ICG_PERIOD)
     first = next(iter(schedule.sequence(motion, 0, 1)[0]))
-    missing = Spike(math.nan, math.inf, math.nan, math.nan, SpikeFlags.MISSING)
     for n in range(6):
-        schedule.observe(n * 3_700_000, {first: 100}, {first: missing})
+        schedule.observe(n * 3_700_000, {first: 100}, {first: missing()})
     row = ROOM.index(first)
     assert schedule.chances(0.02)[row] < 0.1
     assert first not in schedule.sequence(motion, 20_000_000, 1)[0]
@@ -143,6 +148,64 @@ def test_search_lights_everything_but_first_what_should_be_seen() -> None:
     for _ in range(8):
         lit += [next(iter(frame)) for frame in schedule.sequence(motion, 0, 21)]
     assert set(lit) == set(range(40))
+
+
+def test_before_any_pose_leds_found_are_lit_more_often() -> None:
+    """Three of 40 are in sight, which nobody knows: all are tried once, these then again."""
+    schedule = PredictedVisible(ROOM, SH_PERIOD, ICG_PERIOD, latency=0)
+    motion, seen, lit = MotionFilter(CAMERA, ROOM), {3, 17, 31}, []
+    for number in range(100):
+        t_ns = number * ICG_PERIOD * 250
+        ((channel, clocks),) = schedule.sequence(motion, t_ns, 1)[0].items()
+        lit.append(channel)
+        found = spike() if channel in seen else missing()
+        schedule.observe(t_ns, {channel: clocks}, {channel: found})
+    assert set(lit[:60]) == set(range(40))
+    again = [channel in seen for channel in lit[60:]]
+    assert np.mean(again) > 0.4  # not 3 of 40
+    assert len({*lit[60:]} - seen) > 5  # something else may be in sight soon
+
+
+def test_before_any_pose_exposures_are_sought_by_each_led() -> None:
+    """Long, medium, short until it is found; then as it needs; long again when it is gone."""
+    schedule = RoundRobin(LedMap.line(2, 500.0), 400, ICG_PERIOD)
+    motion = MotionFilter(CAMERA, LedMap.line(2, 500.0))
+
+    def clocks(found: Any) -> Any:
+        one, other = schedule.sequence(motion, 0, 2)
+        lit = one | other
+        schedule.observe(0, lit, {0: found, 1: missing()})
+        return lit[0], lit[1]
+
+    lit = [clocks(found) for found in (missing(), spike(8_000.0), spike(), missing(), missing())]
+    assert [one for one, _ in lit] == [400, 100, 200, 200, 400]
+    assert [other for _, other in lit] == [400, 100, 25, 400, 100]
+    clocks(spike(36_000.0, SpikeFlags.SATURATED))
+    assert clocks(spike())[0] == 25
+    # nothing is learnt of how bright they are, as nobody knows how far away
+    assert (schedule.exposure._learnt == -math.inf).all()
+
+
+def test_a_schedule_forgets_with_its_clock() -> None:
+    """What was learnt at times that are now in the future would never fade."""
+    motion = at((500.0, -200.0, 0.7))
+    schedule = Greedy(ROOM, SH_PERIOD, ICG_PERIOD)
+    lit = {n: t for frame in schedule.sequence(motion, 0, 16) for n, t in frame.items()}
+    hour = 3_600_000_000_000
+    schedule.observe(hour, lit, {n: missing() if n % 2 else spike(1e5) for n in lit})
+    alike = Greedy(ROOM, SH_PERIOD, ICG_PERIOD).exposure.fluxes(0.0, 0.0, 1.0)
+    assert schedule.chances(1.0).min() < 0.6
+    schedule.restart()
+    assert (schedule.chances(1.0) == 1).all()
+    gains = schedule.exposure.fluxes(0.0, 0.0, 1.0)[alike > 0] / alike[alike > 0]
+    assert np.ptp(gains) < 1e-9 * gains.mean()  # of all LEDs the same: the mean stays
+
+
+def test_slow_frames_are_forgotten_more_slowly() -> None:
+    """A second is ten frames at 10 Hz: of 40 LEDs, each would be forgotten before its turn."""
+    slow = Greedy(ROOM, SH_PERIOD, 400_000)
+    slow.observe(0, {0: 100}, {0: missing()})
+    assert slow.chances(2.0)[0] < 0.6
 
 
 # -- how long
@@ -205,7 +268,8 @@ def outcomes() -> Any:
             seed=3,
         )
         schedule = policy(ROOM, SH_PERIOD, ICG_PERIOD, per_frame=per_frame)
-        result[policy] = follow(world, MotionFilter(camera, ROOM), schedule, 5000)
+        tracker = Tracker(Calibration(camera, ROOM), schedule=schedule, led_error=0.0)
+        result[policy] = Run(world, tracker).go(5000)
     return result
 
 

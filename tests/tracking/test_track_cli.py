@@ -193,9 +193,12 @@ def test_every_line_is_flushed() -> None:
 
     pipe = Pipe()
     writer = LineWriter(pipe, as_csv, CSV_HEADER)
-    assert pipe.flushed == len(CSV_HEADER) + 1
-    writer(ESTIMATE)
-    assert pipe.flushed == len(pipe.getvalue()) > len(CSV_HEADER) + 1
+    assert pipe.getvalue() == ""  # as long as there is no pose
+    for number in (2, 3):
+        writer(ESTIMATE)
+        assert pipe.flushed == len(pipe.getvalue())
+        assert len(pipe.getvalue().splitlines()) == number
+    assert pipe.getvalue().splitlines().count(CSV_HEADER) == 1
 
 
 # --- UDP ------------------------------------------------------------------------------------------
@@ -238,6 +241,48 @@ def test_what_the_network_refuses_is_counted(monkeypatch: pytest.MonkeyPatch) ->
     for _ in range(3):
         writer(ESTIMATE)
     assert writer.complaint() == "3 of 3 datagrams were not sent: Network is unreachable"
+
+
+@pytest.mark.parametrize("options", ["", " --quiet", " --count 5 -q"])
+def test_datagrams_that_are_refused_are_no_success(
+    options: str, run: Callable[..., Result]
+) -> None:
+    """A broadcast, which the socket is not allowed."""
+    result = run(f"{REPLAY} --udp 255.255.255.255:5005{options}")
+    assert result.code == cli.DOUBTFUL
+    number = 5 if "5" in options else 59
+    said = result.err.splitlines()
+    assert said[-1] == f"{number} of {number} datagrams were not sent: Permission denied"
+    assert len(said) == (2 if not options else 1)
+
+
+@pytest.mark.parametrize(("count", "code"), [([], cli.DOUBTFUL), (["-n", "9999"], cli.INTERRUPTED)])
+def test_datagrams_refused_until_ctrl_c(count: list[str], code: int) -> None:
+    arguments = ["track", "--link", "twin", "--udp", "255.255.255.255:5005", "-q", *count]
+    starter = """
+import os, signal, sys, threading
+from acquisition import cli
+from tracking.output import UdpWriter
+
+send = UdpWriter.__call__
+
+def sending(self, estimate):
+    send(self, estimate)
+    if self.failed == 3:
+        os.kill(os.getpid(), signal.SIGINT)
+
+UdpWriter.__call__ = sending
+cli.main(sys.argv[1:])
+"""
+    result = subprocess.run(
+        [sys.executable, "-c", starter, *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert result.returncode == code, result.stderr
+    assert re.fullmatch(r"(\d+) of \1 datagrams were not sent: .*\n", result.stderr)
 
 
 @pytest.mark.parametrize(
@@ -394,6 +439,13 @@ def test_the_head_comes_with_the_recording(run: Callable[..., Result]) -> None:
         ("track --json --csv", 2, "--json and --csv: one form of output at a time"),
         ("track --json --udp a:1", 2, "--json and --udp: one form"),
         ("track --udp nowhere", 2, "--udp 'nowhere' is no HOST:PORT"),
+        ("track --udp a..b:5005", 2, "--udp a..b:5005: 'a..b' is no name of a host"),
+        (f"track --udp {'a' * 300}:5005", 2, "a' is no name of a host"),
+        (f"{REPLAY} --heading nan", 2, "--heading nan: a number of degrees is needed"),
+        (f"{REPLAY} --heading=-inf", 2, "--heading -inf: a number of degrees is needed"),
+        ("track --link replay none.h5 --csv", 1, "none.h5 cannot be read"),
+        ("track --link replay blind.h5 -c room.json --csv", 1, "were not seen well enough"),
+        (f"{REPLAY} --leds run.h5", 2, "--leds run.h5: it is no text"),
         ("track --method best", 2, "--method best: allowed are filter and thesis"),
         ("track --method thesis --json", 2, "neither errors nor times: leave out --json"),
         ("track --method thesis --heading 3", 2, "--heading: --method thesis does not use it"),
@@ -449,6 +501,20 @@ def test_errors_say_what_to_do(
     assert re.search(message, result.err), result.err
     assert "Traceback" not in result.err
     assert result.out == ""
+
+
+@pytest.mark.parametrize("options", [[], ["--csv"], ["--method", "thesis"]])
+def test_standard_output_that_is_closed_is_told(options: list[str]) -> None:
+    result = subprocess.run(
+        [*LINETRACK, "track", "--link", "twin", *options],
+        preexec_fn=lambda: os.close(1),
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert result.returncode == cli.USAGE
+    assert re.fullmatch(r"linetrack: standard output is closed, .*\n", result.stderr)
 
 
 def test_no_pose_is_told_while_it_lasts(run: Callable[..., Result]) -> None:

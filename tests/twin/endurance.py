@@ -9,8 +9,6 @@ import argparse
 import gc
 import math
 import sys
-import time
-from datetime import datetime
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -18,7 +16,7 @@ import numpy as np
 
 from acquisition.capture import Capture
 from raytransfer.designs import DESIGNS
-from tests.tracking.endurance import Report, resident
+from tests.tracking.endurance import INTERRUPTED, Report, resident, show
 from tests.twin.faults import DEVICE_FAULTS, LINK_FAULTS, FaultyLink
 from tracking.calibration import Calibration
 from tracking.leds import LedMap
@@ -29,7 +27,7 @@ from twin.spikes import Wander
 from twin.world import Led, RandomOcclusions, Wall, World
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Generator
 
     from tracking.tracker import Step
     from twin.link import TwinLink
@@ -114,13 +112,16 @@ class Clock:
         return self._zero + t_ns * 1e-9
 
 
-def run(minutes: float, seed: int, *, spikes: bool) -> Report:
-    """Track through the firmware image: whole frames, or spikes that it finds itself."""
+def minutes(count: float, seed: int, *, spikes: bool) -> Generator[Report]:
+    """Track through the firmware image: whole frames, or spikes that it finds itself.
+
+    Yield what was so far after each minute, and in the end.
+    """
     room, report = Room(seed), Report()
     random = np.random.default_rng([seed, 1])
     icg_period = ICG_PERIODS[spikes]
     period = icg_period / 4e6
-    size, locked = 0, False
+    size, locked, told = 0, False, 0
     with FaultyLink(seed, world=room.world) as link:
         clock = Clock(link)
         tracker = Tracker(room.calibration, schedule=default_schedule(LEDS, icg_period=icg_period))
@@ -131,11 +132,14 @@ def run(minutes: float, seed: int, *, spikes: bool) -> Report:
                 report.losses += locked and not tracker.locked
                 locked = tracker.locked
                 report.seconds = link.machine.seconds
-                if not size and report.seconds > min(WARM, 30 * minutes):
+                if not size and report.seconds > min(WARM, 30 * count):
                     gc.collect()
                     size = resident()
-                if report.seconds > 60 * minutes:
+                if report.seconds > 60 * count:
                     break
+                if report.seconds > 60 * (told + 1):
+                    told += 1
+                    yield report
                 if link.fault is None:
                     chance = random.random() / period
                     if chance < 1 / DEVICE_FAULT_EVERY:
@@ -144,6 +148,12 @@ def run(minutes: float, seed: int, *, spikes: bool) -> Report:
                         link.strike(str(random.choice(LINK_FAULTS)))
             gc.collect()
             report.growth = resident() - size
+    yield report
+
+
+def run(count: float, seed: int, *, spikes: bool) -> Report:
+    """As `minutes`, to the end."""
+    *_, report = minutes(count, seed, spikes=spikes)
     return report
 
 
@@ -163,19 +173,14 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=10.0, help="virtual; default: 10")
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()
-    failed = False
+    code = 0
     for spikes in (False, True):
-        began = time.perf_counter()
-        report = run(arguments.minutes / 2, arguments.seed, spikes=spikes)
         kind = "spikes from the microcontroller" if spikes else "whole frames"
-        took = f"{(time.perf_counter() - began) / 60:.0f} min"
-        sys.stdout.write(
-            f"{datetime.now():%Y-%m-%d}, through the firmware, {kind}: {report}; {took}\n"
-        )
-        for failure in report.failures():
-            sys.stdout.write(f"FAILED: {failure}\n")
-        failed = failed or bool(report.failures())
-    return failed
+        reports = minutes(arguments.minutes / 2, arguments.seed, spikes=spikes)
+        code = max(code, show(f"through the firmware, {kind}", reports))
+        if code == INTERRUPTED:
+            break
+    return code
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,25 +12,33 @@ import pytest
 
 from raytransfer import prototype_head
 from raytransfer.designs import DESIGNS
+from tracking.calibration import Calibration
+from tracking.camera import Camera
 from tracking.leds import LedMap
+from tracking.poses import Prior, optical
+from tracking.spikes import Spike
 from twin import experiments
 from twin.experiments import (
     BETTER,
     CALLS,
     DISTANCES,
     MOVES,
+    Bench,
     Evaluation,
     Measured,
     Move,
     Placed,
     Prototype,
     Rest,
+    Sight,
     Stage,
     Timing,
     Vibration,
     camera_constant,
     causes,
     comparison,
+    fixed,
+    looked,
     measured,
     prototype,
     respaced,
@@ -58,8 +67,13 @@ def inferred(own: Prototype) -> dict[float, Move]:
 
 
 @pytest.fixture(scope="module")
-def better() -> Measured:
-    return measured(DESIGNS[BETTER].system)
+def both() -> tuple[Measured, ...]:
+    return measured([prototype_head(), DESIGNS[BETTER].system])
+
+
+@pytest.fixture(scope="module")
+def better(both: tuple[Measured, ...]) -> Measured:
+    return both[1]
 
 
 @pytest.fixture(scope="module")
@@ -197,10 +211,84 @@ def test_better_head_sees_a_known_heading_shake(better: Measured) -> None:
     assert x.sigma > 10 * better.still[NEAR].jitter[0].sigma
 
 
-def test_no_pixel_is_full_and_every_led_has_its_own_exposure(better: Measured) -> None:
-    for clocks in better.clocks.values():
-        assert all(experiments.SURVEY <= count <= experiments.STREAM[0] for count in clocks)
-    assert len(set(better.clocks[FAR])) > 1
+def test_heads_are_compared_on_equal_terms(both: tuple[Measured, ...]) -> None:
+    same, better = both
+    for distance in DISTANCES:
+        ours, theirs = better.rest[distance], same.rest[distance]
+        assert ours.channels == theirs.channels
+        assert ours.clocks == theirs.clocks
+        assert len(ours.spikes) == len(theirs.spikes)
+        assert len(ours.channels) >= (2 if distance == NEAR else 5)
+        assert np.array_equal(better.placed[distance].true, same.placed[distance].true)
+
+
+def test_no_pixel_is_full(both: tuple[Measured, ...]) -> None:
+    longest = experiments.STREAM[0]
+    for distance in DISTANCES:
+        rests = [one.rest[distance] for one in both]
+        fullest = max(rest.fill for rest in rests)
+        assert fullest < 0.8  # FILL of them, in a survey's light, and noise
+        # and the light that could be had is used
+        assert fullest > 0.5 or max(rests[0].clocks) > longest - experiments.SURVEY
+
+
+def test_every_led_has_its_own_exposure(better: Measured) -> None:
+    for sight in better.rest.values():
+        assert all(experiments.SURVEY <= count <= experiments.STREAM[0] for count in sight.clocks)
+    assert len(set(better.rest[FAR].clocks)) > 1
+
+
+def test_the_head_with_the_highest_spike_sets_the_exposures_of_all() -> None:
+    leds = LedMap.line(2, 500.0)
+    names = BETTER, experiments.OTHER
+    benches = [Bench(DESIGNS[name].system, leds) for name in names]
+    pose = Pose(0.0, 2000.0)
+    alone = [bench.look(pose) for bench in benches]
+    shared = looked(benches, pose)
+    for bench in benches:
+        bench.close()
+    assert shared[0].clocks == shared[1].clocks
+    for channel in range(2):
+        longest, shortest = (sight.clocks[channel] for sight in alone)
+        assert longest > shortest + experiments.SURVEY
+        # in steps, and by another survey's noise
+        assert abs(shared[0].clocks[channel] - shortest) <= experiments.SURVEY
+    # that the other's spikes are less high is not made up for
+    assert shared[0].fill < 0.9 * shared[1].fill
+
+
+def test_three_leds_solve_the_degree_that_costs_two_centimetres() -> None:
+    # single frames, the camera as drawn and the LEDs where they are
+    leds = LedMap.line(3, 500.0, 300.0)
+    bench = Bench(DESIGNS[BETTER].system, leds)
+    calibration = Calibration(Camera.from_system(bench.head), leds)
+    turn = math.radians(1)
+    for distance in (NEAR, 2500.0, FAR):
+        sight = bench.look(Pose(0.0, distance, turn), 10)
+        assert sight.channels == (0, 1, 2)
+        off = fixed(calibration, sight) - (0.0, distance, turn)
+        assert math.hypot(*np.sqrt(np.mean(off[:, :2] ** 2, axis=0))) <= 1.0, distance
+        assert np.abs(off[:, 2]).max() <= math.radians(0.02)
+        pair = replace(sight, channels=(0, 2), spikes=[frame[::2] for frame in sight.spikes])
+        assumed = fixed(calibration, pair, Prior(0.0, 0.0))
+        assert assumed[:, 0].mean() == pytest.approx(
+            turn * (distance + 500**2 / distance), rel=0.02
+        )
+    bench.close()
+
+
+def test_leds_are_not_seen_from_behind() -> None:
+    # reversed, a line of LEDs has a pose behind it, where these do not shine
+    leds = LedMap.line(4, 500.0, 200.0)
+    camera = Camera(4000.0, 1823.5)
+    pixels = camera.project(optical(leds.positions, 100.0, -2000.0, math.pi))
+    spikes = [Spike(float(at), 0.05, 20.0, 1e4) for at in pixels]
+    sight = Sight(leds.channels, [spikes], (100,) * 4, 0.5, np.array([0]), np.array([0]))
+    with pytest.raises(ValueError, match="lit side"):
+        fixed(Calibration(camera, leds), sight)
+    back = LedMap(leds.channels, leds.positions, [math.pi] * 4)
+    (found,) = fixed(Calibration(camera, back), sight)
+    assert found[:2] == pytest.approx([100.0, -2000.0], abs=0.1)
 
 
 def test_stream_is_as_fast_as_it_should_be(timing: Timing) -> None:
@@ -222,14 +310,15 @@ def test_placed() -> None:
 def test_command_prints_the_table(
     own: Prototype,
     inferred: dict[float, Move],
-    better: Measured,
+    both: tuple[Measured, ...],
     timing: Timing,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    # two columns stand in for others, which would take as long again
-    found = Evaluation(own, own, inferred, better, better, timing)
+    same, better = both
+    # some columns stand in for others, which would take as long again
+    found = Evaluation(own, own, inferred, same, better, better, timing)
     seeds: list[int] = []
 
     def evaluated(*, seed: int) -> Evaluation:
@@ -248,7 +337,10 @@ def test_command_prints_the_table(
     rows = {row[1]: row for row in comparison(found).rows}
     assert rows["100 mm along x at 4.15 m, px"][2:4] == ("83", f"{own.x[FAR].scale:.1f}")
     jitter = better.still[NEAR].jitter[0].sigma
-    assert rows["jitter x at 1.30 m, σ, mm (d)"][-1] == f"{jitter:.4f}"
+    assert rows["jitter x at 1.30 m, σ, mm (d)"][-2:] == (f"{jitter:.4f}",) * 2
+    clocks = better.rest[NEAR].clocks
+    lit = f"{len(clocks)}: {min(clocks)}–{max(clocks)}"
+    assert rows["LEDs lit at 1.30 m: clocks (g)"][2:] == ("2: 100", "2: 100", lit, lit, lit)
     why = causes(found)
     assert {"slabs", "aperture", "caustics", "spacing", "common", "1/y"} <= {r[0] for r in why.rows}
     markdown = why._repr_markdown_().splitlines()
@@ -259,14 +351,15 @@ def test_command_prints_the_table(
 def test_command_says_where_it_cannot_write(
     own: Prototype,
     inferred: dict[float, Move],
-    better: Measured,
+    both: tuple[Measured, ...],
     timing: Timing,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     (tmp_path / "file").write_text("")
-    found = Evaluation(own, own, inferred, better, better, timing)
+    same, better = both
+    found = Evaluation(own, own, inferred, same, better, better, timing)
     monkeypatch.setattr(experiments, "evaluate", lambda **_: found)
     monkeypatch.setattr(sys, "argv", ["experiments", "--output", str(tmp_path / "file")])
     assert experiments.main() == 1

@@ -8,7 +8,17 @@ from raytransfer import TCD1304
 from raytransfer.designs import DESIGNS
 from raytransfer.irradiance import irradiance
 from raytransfer.sources import Emitter
-from tests.tracking.endurance import ICG_PERIOD, SH_PERIOD, head, room, run
+from tests.tracking.endurance import (
+    ICG_PERIOD,
+    INTERRUPTED,
+    SH_PERIOD,
+    Report,
+    head,
+    hours,
+    room,
+    run,
+    show,
+)
 from tracking.spikes import SpikeFinder, SpikeFlags
 from twin.spikes import Faults, SpikeTable, SpikeWorld, Wander
 from twin.world import Led
@@ -236,6 +246,20 @@ def test_an_hour_of_everything() -> None:
     assert len(report.recoveries) > 20
     assert report.possible > 0.9 * report.frames
     assert report.locked > 0.9 * report.possible
+
+
+def test_a_run_that_is_interrupted_says_what_it_has(capsys: Any) -> None:
+    def reports() -> Any:
+        going = hours(0.001, seed=1)
+        yield next(going)
+        raise KeyboardInterrupt
+
+    assert show("in a test", reports()) == INTERRUPTED
+    far, end = capsys.readouterr().out.splitlines()[:2]
+    assert far.startswith("… 0.1 min, 973 frames, at ")
+    assert "in a test: 0.1 min, 973 frames, at " in end
+    assert end.endswith("INTERRUPTED")
+    assert show("in a test", iter([Report()])) == 0
 
 
 def test_room_is_seen_from_anywhere() -> None:
