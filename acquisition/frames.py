@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import IntFlag
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
 import numpy as np
@@ -57,6 +57,11 @@ class FrameFlags(IntFlag):
     """Frames before this one came damaged or not at all. Without LEDs, those may be unknown."""
 
 
+@lru_cache(maxsize=1024)
+def _channels(leds: int) -> tuple[int, ...]:
+    return tuple(n for n in range(leds.bit_length()) if leds >> n & 1)
+
+
 class _Readout:
     """What every read-out is described by."""
 
@@ -78,7 +83,7 @@ class _Readout:
     @property
     def channels(self) -> tuple[int, ...]:
         """Channels of the LEDs lit, ascending."""
-        return tuple(n for n in range(self.leds.bit_length()) if self.leds >> n & 1)
+        return _channels(self.leds)
 
     def replaced(self, **values: Any) -> Self:
         """Return a copy with other values (not pixels), as `dataclasses.replace` but unchecked."""
