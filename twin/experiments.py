@@ -30,7 +30,6 @@ from raytransfer.designs import DESIGNS, Design
 from raytransfer.heads import Head
 from tracking.baseline import positions
 from tracking.calibration import Calibration, Observation, bundle
-from tracking.camera import Camera
 from tracking.evaluation import (
     Errors,
     Jitter,
@@ -630,7 +629,7 @@ def calibrated(
         bundle(
             observations,
             leds,
-            Camera.from_system(bench.head),
+            nominal_camera(Design(bench.head)),
             led_sigma=TAPE,
             correction=bench.finder.correction,
         )
