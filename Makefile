@@ -83,10 +83,11 @@ agreement: $(BENCH_STAMP)
 	$(BENCH)/bin/python -W ignore -m benchmarks.agreement
 
 # link faults, then tracking: 10 virtual minutes through the firmware, 24 h of simulated spikes
+# (which go on where they were interrupted)
 soak: setup
 	$(BIN)/python -m tests.twin.soak
 	$(BIN)/python -m tests.twin.endurance --minutes 10
-	$(BIN)/python -m tests.tracking.endurance --hours 24
+	$(BIN)/python -m tests.tracking.endurance --hours 24 --state build/soak
 
 flash: setup
 	@$(MAKE) --no-print-directory -C firmware flash

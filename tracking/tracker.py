@@ -89,6 +89,7 @@ _DOUBLE, _CLIPPED = SpikeFlags.DOUBLE.value, SpikeFlags.CLIPPED.value
 _REFLECTION = SpikeFlags.REFLECTION.value
 _UNCERTAIN = _CLIPPED | _DOUBLE
 _ODD = SpikeFlags.MISSING.value | _UNCERTAIN
+_KEPT = PoseFlags.INCONSISTENT | PoseFlags.UNCHECKED
 _USUAL = 1.6  # times the mean width: wider is unusual
 _LEAST = 0.15  # of a lamp's height by which its light may have changed
 _APART = 1.0  # widths: spikes of one frame that are nearer cannot be told apart
@@ -610,8 +611,8 @@ class Tracker:
             )
         # of all LEDs of the frame; the filter's own flags are those of the last one
         outcomes = {found.outcome for found in self.innovations}
-        kept = PoseFlags.INCONSISTENT | PoseFlags.UNCHECKED
-        flags |= self._filter.estimate().flags & kept | self._fresh
+        now = self._filter.estimate(max(t_ns, self._filter.t_ns))
+        flags |= now.flags & _KEPT | self._fresh
         self._fresh = PoseFlags.NONE
         if Outcome.REJECTED in outcomes:
             flags |= PoseFlags.REJECTED
@@ -620,7 +621,7 @@ class Tracker:
         self._known = True
         if not lost and Outcome.USED not in outcomes:
             flags |= PoseFlags.PREDICTED
-        now = replace(self._filter.estimate(max(t_ns, self._filter.t_ns)), flags=flags)
+        now = replace(now, flags=flags)
         if self._heading is not None:  # rounding aside it has not changed
             now.covariance[2] = now.covariance[:, 2] = 0.0
             now = replace(now, heading=self._heading.value)

@@ -458,6 +458,8 @@ class SpikeWorld:
         dict of int to Spike
             One for each LED lit: the strongest in its window, whoever's it is.
         """
+        if not lit:
+            return {}
         rows = np.array([self._rows[channel] for channel in lit], np.int64)
         seconds = np.array([clocks / self._clock for clocks in lit.values()])
         if windows is None:

@@ -7,15 +7,18 @@ from __future__ import annotations
 
 import argparse
 import gc
+import importlib
 import math
 import os
+import pickle
 import sys
 import time
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -63,6 +66,7 @@ USELESS = int(SpikeFlags.MISSING | SpikeFlags.SATURATED)
 EVERY = 199
 """Poses of which one is kept for the errors' statistics."""
 
+WARM = 20_000  # frames, after which nothing new is loaded
 NEEDED = 3  # LEDs, for a pose
 RECOVERY = 0.5  # s
 WRONG = 1e-4  # part of all poses
@@ -307,7 +311,9 @@ def resident() -> int:
     return pages * os.sysconf("SC_PAGE_SIZE")
 
 
-def hours(count: float, seed: int, *, faults: Faults | None = None) -> Generator[Report]:
+def hours(
+    count: float, seed: int, *, faults: Faults | None = None, state: Path | None = None
+) -> Generator[Report]:
     """Track a wandering tracker in a room of 40 LEDs; yield what was so far after each hour.
 
     It is the `Tracker` that users have, with `default_schedule`: search, windows, judging of
@@ -322,7 +328,30 @@ def hours(count: float, seed: int, *, faults: Faults | None = None) -> Generator
     for them); firmware, its own search for spikes, and the capture with its repair of what was
     damaged (`tests.twin.endurance` has all these); a height that is not known, a heading that is;
     errors of the camera other than those of its fit. Light is that of the end of each exposure.
+
+    With a file for the state, a run that was interrupted goes on after the last whole hour.
     """
+    running = load(state) if state and state.exists() else begin(seed, faults)
+    frames = round(count * FRAMES)
+    grown = running.report.growth  # in the processes before this one
+    size = 0
+    while True:
+        report = running.report
+        left = frames - report.frames
+        if size or left <= 0:
+            yield report
+            if left <= 0:
+                return
+        running.go(min(left, FRAMES - report.frames % FRAMES if size else WARM))
+        gc.collect()
+        size = size or resident()
+        report.growth = max(grown, resident() - size)
+        if state and not report.frames % FRAMES:
+            keep(running, state)
+
+
+def begin(seed: int, faults: Faults | None) -> Run:
+    """Return a run of which nothing has happened yet."""
     table, camera = head()
     leds = room()
     random = np.random.default_rng([seed, 1])
@@ -343,19 +372,32 @@ def hours(count: float, seed: int, *, faults: Faults | None = None) -> Generator
     tracker = Tracker(
         Calibration(camera, known), schedule=default_schedule(known, SH_PERIOD, ICG_PERIOD)
     )
-    running = Run(world, tracker)
-    frames = round(count * FRAMES)
-    report = running.go(min(frames, 20_000))
-    gc.collect()
-    size = resident()
-    while True:
-        yield report
-        left = frames - report.frames
-        if not left:
-            return
-        running.go(min(left, FRAMES - report.frames % FRAMES))
-        gc.collect()
-        report.growth = resident() - size
+    return Run(world, tracker)
+
+
+class _Pickler(pickle.Pickler):
+    """Pickles objects that keep the module of their compiled functions."""
+
+    def reducer_override(self, obj: Any) -> Any:
+        if isinstance(obj, ModuleType):
+            return importlib.import_module, (obj.__name__,)
+        return NotImplemented
+
+
+def keep(running: Run, path: Path) -> None:
+    """Write a run to a file, whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_suffix(".part")
+    with part.open("wb") as file:
+        _Pickler(file).dump(running)
+    part.replace(path)
+
+
+def load(path: Path) -> Run:
+    """Return the run that `keep` has written: of one's own, a pickle can do anything."""
+    with path.open("rb") as file:
+        running: Run = pickle.load(file)  # noqa: S301
+    return running
 
 
 def run(count: float, seed: int, *, faults: Faults | None = None) -> Report:
@@ -369,8 +411,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.tracking.endurance", description=__doc__)
     parser.add_argument("--hours", type=float, default=24.0, help="virtual; default: 24")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--state", type=Path, help="goes on from this file, kept hour by hour")
     arguments = parser.parse_args()
-    return show("simulated spikes", hours(arguments.hours, arguments.seed))
+    reports = hours(arguments.hours, arguments.seed, state=arguments.state)
+    return show("simulated spikes", reports)
 
 
 def show(what: str, reports: Iterable[Report]) -> int:

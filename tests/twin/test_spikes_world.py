@@ -1,4 +1,5 @@
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,6 +9,7 @@ from raytransfer import TCD1304
 from raytransfer.designs import DESIGNS
 from raytransfer.irradiance import irradiance
 from raytransfer.sources import Emitter
+from tests.tracking import endurance
 from tests.tracking.endurance import (
     ICG_PERIOD,
     INTERRUPTED,
@@ -260,6 +262,23 @@ def test_a_run_that_is_interrupted_says_what_it_has(capsys: Any) -> None:
     assert "in a test: 0.1 min, 973 frames, at " in end
     assert end.endswith("INTERRUPTED")
     assert show("in a test", iter([Report()])) == 0
+
+
+def test_a_run_that_is_interrupted_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(endurance, "FRAMES", 1000)
+    monkeypatch.setattr(endurance, "WARM", 300)
+    state = tmp_path / "new" / "state"
+
+    def seen(report: Report) -> list[object]:
+        return [report.frames, report.locked, report.losses, report.useful, *report.errors]
+
+    *_, straight = [seen(report) for report in hours(4.0, seed=1)]
+    begun = hours(4.0, seed=1, state=state)
+    assert [next(begun).frames for _ in range(4)] == [300, 1000, 2000, 3000]
+    begun.close()
+    state.with_suffix(".part").write_bytes(b"half")  # as if the machine had stopped while writing
+    *_, again = [seen(report) for report in hours(4.0, seed=1, state=state)]
+    assert again == straight
 
 
 def test_room_is_seen_from_anywhere() -> None:
