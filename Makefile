@@ -59,7 +59,7 @@ run: setup
 # matrices are small: BLAS's threads cost more than they bring
 test: export OPENBLAS_NUM_THREADS = 1
 test: setup lint
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
 lint: setup
 	$(BIN)/ruff check
