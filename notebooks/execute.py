@@ -13,11 +13,15 @@ import os
 import re
 import sys
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import nbformat
 from nbclient import NotebookClient
+
+AT_ONCE = min(os.cpu_count() or 1, 4)
 
 WIDGET_STATE = "application/vnd.jupyter.widget-state+json"
 
@@ -107,14 +111,17 @@ def main() -> int:
     )
     options = parser.parse_args()
     changed = 0
-    for path in options.notebooks or sorted(Path(__file__).parent.glob("*.ipynb")):
-        new, old = executed(path), path.read_text(encoding="utf-8")
-        changed += new != old
-        print(f"{path}: {'unchanged' if new == old else 'changed'}")
-        if new != old and not options.check:
-            part = path.with_suffix(".part")
-            part.write_text(new, encoding="utf-8")
-            part.replace(path)
+    paths = options.notebooks or sorted(Path(__file__).parent.glob("*.ipynb"))
+    with ThreadPoolExecutor(AT_ONCE) as kernels, ExitStack() as at_end:
+        at_end.callback(kernels.shutdown, wait=False, cancel_futures=True)  # also after an error
+        for path, new in zip(paths, kernels.map(executed, paths), strict=True):
+            old = path.read_text(encoding="utf-8")
+            changed += new != old
+            print(f"{path}: {'unchanged' if new == old else 'changed'}", flush=True)
+            if new != old and not options.check:
+                part = path.with_suffix(".part")
+                part.write_text(new, encoding="utf-8")
+                part.replace(path)
     return 1 if options.check and changed else 0
 
 
