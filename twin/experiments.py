@@ -51,7 +51,7 @@ from twin.rooms import load_room
 from twin.world import Led, Pose, World
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -157,15 +157,22 @@ class Stage:
 class Room(World):
     """A world that computes light once for each pose: what is put down stays there for a while."""
 
-    def lit(self, seconds: float = 0.0) -> Iterator[tuple[int, NDArray[np.float64]]]:
+    def lit(
+        self, seconds: float = 0.0, channels: Collection[int] | None = None
+    ) -> Iterator[tuple[int, NDArray[np.float64]]]:
         """As `World.lit`."""
         pose = self.pose(seconds)
-        known: tuple[Pose, list[tuple[int, NDArray[np.float64]]]] | None
-        known = self.__dict__.get("_known")
-        if known is None or known[0] != pose:
-            known = pose, list(super().lit(seconds))
-            self.__dict__["_known"] = known
-        yield from known[1]
+        known: tuple[Pose, dict[int, NDArray[np.float64] | None]]
+        known = self.__dict__.get("_known", (pose, {}))
+        if known[0] != pose:
+            known = pose, {}
+        self.__dict__["_known"] = known
+        asked = [led.channel for led in self.leds if channels is None or led.channel in channels]
+        if new := [channel for channel in asked if channel not in known[1]]:
+            known[1].update(dict.fromkeys(new) | dict(super().lit(seconds, new)))
+        for channel in asked:
+            if (light := known[1][channel]) is not None:
+                yield channel, light
 
 
 def room(head: OpticalSystem, leds: LedMap, stage: Stage) -> Room:

@@ -105,11 +105,10 @@ class TwinLink:
         self.spi_clock = spi_clock
         self.host_latency = host_latency
         self._rates = np.zeros((1 + CHANNELS, self.world.sensor.pixels))
-        self._lit: set[int] = set()
-        self._lit_until = 0
+        self._step = self._step_end = self._known = 0
         self._rates[0] = self.world.ambient_rate() * self.sensor.response
         self._rates[0] += self.sensor.dark_rates()
-        self._light(0)
+        self._light(0, lit=(1 << CHANNELS) - 1)
         figures = self.sensor.electronics
         self.machine = Machine(
             firmware_image() if image is None else image,
@@ -124,17 +123,23 @@ class TwinLink:
         self.machine.run(BOOT)
         self._open = True
 
-    def _light(self, cycles: int) -> bool:
-        """Electrons per second: after what is always there, a row for each LED channel."""
-        if cycles < self._lit_until:  # all LEDs of an exposure ask, one after the other
+    def _light(self, cycles: int, lit: int) -> bool:
+        """Electrons per second: after what is always there, a row for each LED channel.
+
+        Of those lit, by bit: light of an LED that is not would be computed in vain.
+        """
+        if cycles >= self._step_end:
+            self._step, self._step_end = cycles, cycles + round(LIGHT_STEP * CLOCK)
+            self._known = 0
+        new = lit & ~self._known  # all LEDs of an exposure ask, one after the other
+        if not new:
             return False
-        self._lit_until = cycles + round(LIGHT_STEP * CLOCK)
-        before, self._lit = self._lit, set()
-        for channel, rate in self.world.lit(cycles / CLOCK):
-            np.multiply(rate, self.sensor.response, out=self._rates[1 + channel])
-            self._lit.add(channel)
-        for channel in before - self._lit:
-            self._rates[1 + channel] = 0.0
+        self._known |= new
+        channels = [channel for channel in range(CHANNELS) if new >> channel & 1]
+        rates = dict(self.world.lit(self._step / CLOCK, channels))
+        for channel in channels:
+            rate = rates.get(channel)
+            self._rates[1 + channel] = 0.0 if rate is None else rate * self.sensor.response
         return True
 
     def _digitise(self, charge: NDArray[np.float64], _: int) -> NDArray[np.uint16]:

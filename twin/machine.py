@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
     #: (charge in electrons by pixel, cycles of the transfer) -> 3694 codes and the idle level's
     Digitise = Callable[[NDArray[np.float64], int], ArrayLike]
-    #: (cycles) -> whether it has changed the rates
-    Light = Callable[[int], bool]
+    #: (cycles, LEDs lit from then on, by bit) -> whether it has changed the rates
+    Light = Callable[[int, int], bool]
 
 __all__ = ["CLOCK", "Machine", "MachineError", "TimingViolation", "Violation"]
 
@@ -56,7 +56,7 @@ _UNICORN = (
 _KINDS = ["fM", "t1", "t2", "t3", "t4", "SH/ICG", "integration", "cut", "fM changed"]
 
 _DIGITISE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_uint64, ctypes.c_void_p)
-_LIGHT = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_uint64)
+_LIGHT = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_uint64, ctypes.c_uint64)
 
 
 class _Config(ctypes.Structure):
@@ -216,7 +216,8 @@ class Machine:
         the idle output. None: the idle code everywhere.
     light
         Called, if the world moves, when an LED goes on and when a read-out starts, with the time
-        in cycles; may change `rates` in place and returns whether it did.
+        in cycles and the channels that are lit from then on, by bit: row 0 and their rows are the
+        ones that count until the next call. May change `rates` in place; returns whether it did.
     transfer_fraction
         Part of a pixel's charge that an SH pulse takes; the rest is image lag.
     full_well
@@ -334,10 +335,10 @@ class Machine:
             return 1
         return 0
 
-    def _light(self, time: int) -> int:
+    def _light(self, time: int, lit: int) -> int:
         try:
             assert self._light_python is not None  # noqa: S101
-            return bool(self._light_python(time // TICKS_PER_CYCLE))
+            return bool(self._light_python(time // TICKS_PER_CYCLE, lit))
         except BaseException as error:  # noqa: BLE001 - raised by _check
             self._exception = error
             return -1

@@ -445,10 +445,19 @@ class World:
             rates[channel] = rate
         return rates
 
-    def lit(self, seconds: float = 0.0) -> Iterator[tuple[int, NDArray[np.float64]]]:
+    def lit(
+        self, seconds: float = 0.0, channels: Collection[int] | None = None
+    ) -> Iterator[tuple[int, NDArray[np.float64]]]:
         """Yield the rows of `rates` that are not dark, with their channels.
 
         What a 64-row table would cost twice a frame is saved, and whatever is out of sight.
+
+        Parameters
+        ----------
+        seconds : float
+            When.
+        channels : collection of int, optional
+            Of the LEDs in question; all when left out.
         """
         pose, hidden = self.pose(seconds), self.hidden(seconds)
         eye = (pose.x, pose.y, pose.z)
@@ -457,6 +466,8 @@ class World:
         lit: dict[int, NDArray[np.float64]] = {}
         places = self._seen(self._positions, pose).tolist()
         for (led, wall), place in zip(self._sources, places, strict=True):
+            if channels is not None and led.channel not in channels:
+                continue
             if led.channel in hidden or (wall and not wall.shows(led, eye[0], eye[1])):
                 continue
             if any(other.hides(led, eye[0], eye[1], wall) for other in self.walls):

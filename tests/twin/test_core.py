@@ -670,7 +670,7 @@ def test_moving_world_is_asked(build: Build) -> None:
     times = []
     rates = np.zeros((65, 3648))
 
-    def light(time: int) -> bool:
+    def light(time: int, _lit: int) -> bool:
         times.append(time)
         rates[0] = 1e6 * len(times)
         return True

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -15,7 +17,12 @@ from tracking.leds import LedMap
 from twin.link import TwinLink, open_twin
 from twin.machine import CLOCK
 from twin.rooms import load_room
-from twin.world import Led, World
+from twin.world import Led, Pose, World
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator
+
+    from numpy.typing import NDArray
 
 CYCLES = CLOCK // MASTER_CLOCK
 STREAM = Command(200, 14800, 5, Mode.STREAM, [{0: 80}, {2: 200, 5: 100}, {}])
@@ -85,3 +92,35 @@ def test_what_is_told_of_the_leds() -> None:
     assert told == LedMap([3, 9], [[-100, 20, 5], [300, 0, 0]], [0.1, 0.0])
     with open_twin() as link:
         assert LedMap(*link.known_leds) == LedMap.line(2, 500.0)
+
+
+def test_light_of_a_moving_tracker_is_computed_for_leds_that_are_lit_and_no_others() -> None:
+    """And frames are the same, to the last count, as if all of it were."""
+    asked: list[int] = []
+
+    class Watched(World):
+        lavish = False
+
+        def lit(
+            self, seconds: float = 0.0, channels: Collection[int] | None = None
+        ) -> Iterator[tuple[int, NDArray[np.float64]]]:
+            if seconds and channels is not None:  # at 0 all are asked for
+                asked.extend(channels)
+            return super().lit(seconds, None if self.lavish else channels)
+
+    class Lavish(Watched):
+        lavish = True
+
+    def swaying(seconds: float) -> Pose:
+        return Pose(100 * math.sin(9 * seconds), 1700.0, 0.05 * math.cos(7 * seconds))
+
+    leds = [Led(channel, (50.0 * channel - 150, 0.0, 0.0)) for channel in (0, 2, 5, 7)]
+    captured = []
+    for kind in (Watched, Lavish):
+        with TwinLink(kind(leds, swaying), seed=2) as link:
+            captured.append(list(capture(link, replace(STREAM, count=9))))
+        assert set(asked) == {0, 2, 5}
+    for frame, same in zip(*captured, strict=True):
+        np.testing.assert_array_equal(frame.pixels, same.pixels)
+        depth = frame.dark_level - frame.pixels.min()
+        assert depth > 200 if frame.exposures else depth < 50

@@ -141,10 +141,10 @@ static void fold_all(struct machine *m, uint64_t time) {
 
 void ccd_rates_changed(struct machine *m) { m->ccd.row_known[0] = m->ccd.row_known[1] = 0; }
 
-static void world_moves(struct machine *m, uint64_t time) {
+static void world_moves(struct machine *m, uint64_t lit, uint64_t time) {
     if (!m->config.light || m->failed) return;
-    fold_all(m, time);
-    int changed = m->config.light(time);
+    fold_all(m, time); /* no weight is left: rates of LEDs that are not lit no longer count */
+    int changed = m->config.light(time, lit);
     if (changed < 0)
         (void)call_failed(m);
     else if (changed)
@@ -168,7 +168,7 @@ void ccd_light(struct machine *m, unsigned channel, bool on, uint64_t time) {
     uint64_t bit = (uint64_t)1 << channel;
     if (((c->lit & bit) != 0) == on) return;
     if (on) {
-        world_moves(m, time);
+        world_moves(m, c->lit | bit, time);
         c->lit |= bit;
         c->weighted |= bit;
         c->since[channel + 1] = time;
@@ -300,7 +300,7 @@ void ccd_icg(struct machine *m, bool level, uint64_t time) {
     c->icg = level;
     if (level) {
         start_readout(m, time);
-        world_moves(m, time);
+        world_moves(m, c->lit, time);
         return;
     }
     if (c->reading && time < c->icg_rise + LAST_PIXEL * c->element) {

@@ -84,8 +84,9 @@ struct unicorn {
 /* Pixels' charge (electrons, mean) and ticks of their transfer in; 3694 codes and the idle one out.
  * A callback returns 0, or nonzero when it failed. */
 typedef int (*digitise_fn)(const double *charge, uint64_t time, uint16_t *codes);
-/* Called when light matters and the world moves; returns 1 if it changed the rates, -1 on failure. */
-typedef int (*light_fn)(uint64_t time);
+/* Called when light matters and the world moves, with the LEDs that are lit from then on, by bit: only
+ * their rates count until the next call. Returns 1 if it changed the rates, -1 on failure. */
+typedef int (*light_fn)(uint64_t time, uint64_t lit);
 
 struct config {
     struct unicorn unicorn;
