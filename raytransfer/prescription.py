@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -73,15 +74,19 @@ def prescription(system: OpticalSystem, wavelength: float = D_LINE) -> Prescript
     )
 
 
+@lru_cache(maxsize=64)
 def surface_frames(
     system: OpticalSystem,
-) -> list[tuple[Surface, NDArray[np.float64], NDArray[np.float64]]]:
+) -> tuple[tuple[Surface, NDArray[np.float64], NDArray[np.float64]], ...]:
     """Every surface with the rotation and the vertex of its frame, in that of the system."""
-    return [
+    frames = tuple(
         (surface, rotation, origin + surface.z * rotation[:, 2])
         for element, (rotation, origin) in zip(system.elements, system.places(), strict=False)
         for surface in element.surfaces()
-    ]
+    )
+    for _, rotation, origin in frames:  # are shared
+        rotation.flags.writeable = origin.flags.writeable = False
+    return frames
 
 
 def _target(system: OpticalSystem) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
