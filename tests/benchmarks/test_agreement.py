@@ -114,8 +114,7 @@ def test_surfaces_are_placed_as_the_tracer_places_them() -> None:
     assert sum(bool(system.placements) for system in systems) > 4
     for system in systems:
         *placed, sensor = peers.places(system, lambda material: material.index())
-        frames = surface_frames(system)
-        frames.append((sensor.surface, *system.places()[-1]))
+        frames = [*surface_frames(system), (sensor.surface, *system.places()[-1])]
         for place, (surface, rotation, origin) in zip([*placed, sensor], frames, strict=True):
             assert place.surface == surface
             np.testing.assert_allclose(place.rotation, rotation, rtol=0, atol=1e-15)
