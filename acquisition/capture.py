@@ -626,7 +626,6 @@ class Capture:
         if status.refusal is not Refusal.NONE:
             self._refuse(status)
             return
-        self._refusal = None
         if self._pending is None:
             return  # it has nothing else to send
         self._confirm(0)  # sequence numbers and LED sequence begin together
@@ -640,6 +639,7 @@ class Capture:
             # the number of frames to deliver is the capture's, whatever a change says
             self._command = replace(self._pending, count=self._command.count)
             self._tries = 0
+        self._refusal = None
         self._pending, self._base, self._doubtful = None, base, False
 
     def _resend(self, reason: str) -> None:

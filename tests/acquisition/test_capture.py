@@ -8,7 +8,7 @@ import threading
 import time
 import tracemalloc
 from contextlib import suppress
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -411,6 +411,24 @@ def test_refusals() -> None:
     with pytest.raises(Refused) as caught:
         list(capture(link, stream(3)))
     assert caught.value.reason is Refusal.CHECKSUM
+
+
+def test_refusals_of_commands_that_nobody_sent_are_not_added_up() -> None:
+    """Garbage taken for a command is refused; what is sent again, a frame may confirm."""
+    link = FakeMcu()
+    frames = Capture(link, stream())
+    for _ in range(3):
+        found = list(itertools.islice(frames, 5))
+        check(found)
+        plain, refusal = link.exchange, encode_status(Status(Refusal.VERSION, "", 100, 20000))
+
+        def refused(tx: bytes, plain: Any = plain, refusal: bytes = refusal) -> bytes:
+            link.exchange = plain  # type: ignore[method-assign]
+            plain(tx)
+            return refusal
+
+        link.exchange = refused  # type: ignore[method-assign]
+    assert len(list(itertools.islice(frames, 5))) == 5
 
 
 def test_unknown_firmware_is_not_a_broken_wire() -> None:
