@@ -198,6 +198,8 @@ def used_light(mount: LensMount, system: OpticalSystem | None = None) -> NDArray
         near &= np.abs(arrived.x) <= mount.sensor.length / 2
         if near.any():
             paths.append(path(system, rays.position[:, near], rays.direction[:, near]))
+    if not paths:
+        return np.empty((len(surface_frames(system)) + 2, 3, 0))
     points = np.concatenate(paths, axis=2)
     start, first = points[:2]
     back = (first[2] - (mount.front - 10.0)) / (first[2] - start[2])
@@ -221,6 +223,8 @@ def first_hit(
         0 at the start to 1 at the end, infinite where none is met.
     """
     result = np.full(start.shape[1], np.inf)
+    if not len(result):
+        return result
     low = np.minimum(start.min(axis=1), end.min(axis=1))
     high = np.maximum(start.max(axis=1), end.max(axis=1))
     within = (triangles.max(axis=1) >= low) & (triangles.min(axis=1) <= high)
@@ -254,6 +258,8 @@ def _blocked(points: NDArray[np.float64], triangles: NDArray[np.float64]) -> NDA
 
 def _light(mount: LensMount, triangles: NDArray[np.float64]) -> Iterator[Finding]:
     points = used_light(mount)
+    if not points.shape[2]:
+        yield Finding("light", "mount", "no light from the field reaches the pixel line")
     blocked = _blocked(points, triangles)
     if blocked.any():
         first = points[1][:, blocked.argmax()]
@@ -331,12 +337,10 @@ def _hole(
     filled = (bar ^ body).volume() / bar.volume()
     if filled > 1e-3:
         return f"{filled:.0%} of it is filled"
-    inner, outer = (
-        manifold(Cylinder(axis, at, low, high, diameter + extra))
-        for extra in (2 * TOLERANCE, 2 * wall)
+    around, hole = (
+        manifold(Cylinder(axis, at, low, high, size)) for size in (diameter + 2 * wall, diameter)
     )
-    sleeve = outer - inner
-    missing = 1 - (sleeve ^ body).volume() / sleeve.volume()
+    missing = 1 - (around ^ body).volume() / (around.volume() - hole.volume())
     if missing > 1e-3:
         return f"{missing:.0%} of the {wall:g} mm around it are missing"
     return ""

@@ -22,6 +22,7 @@ from hardware.solids import (
     Difference,
     Intersection,
     Lathe,
+    Placed,
     Prism,
     Union,
     arc,
@@ -209,6 +210,17 @@ class LensMount:
         """Both halves by name."""
         return {"lower": self.lower, "upper": self.upper}
 
+    def printed(self) -> dict[str, Solid]:
+        """Return both halves by name as they are printed: z up from the bed, the outer face down.
+
+        All that is cut into them is then open to above, but for the board's screw holes.
+        """
+        up = self.half_size[1]
+        return {
+            "lower": Placed(self.lower, (0.0, 0.0, up), "x", 1),
+            "upper": Placed(self.upper, (0.0, 0.0, up), "x", -1),
+        }
+
     def heights(self) -> dict[str, float]:
         """Height of every lens's last vertex above the window's outer face, mm, by name."""
         placed = [p for p in self.system.layout() if isinstance(p.element, Lens | SphericalLens)]
@@ -301,7 +313,7 @@ def lens_mount(
     board = sensor_board(sensor) if board is None else board
     rules = mount_rules() if rules is None else rules
     window = window_place(system, sensor)
-    stations = _stations(system, rules)
+    stations = _stations(system, sensor, rules)
     lenses = tuple(station for station in stations if isinstance(station, MountedLens))
     if not lenses:
         raise ValueError(f"{system.name}: there is no lens to mount")
@@ -384,14 +396,14 @@ def window_place(system: OpticalSystem, sensor: LineSensor) -> float:
     return last.back + system.sensor_distance - sensor.top_to_chip
 
 
-def _stations(system: OpticalSystem, rules: Rules) -> tuple[_Station, ...]:
+def _stations(system: OpticalSystem, sensor: LineSensor, rules: Rules) -> tuple[_Station, ...]:
     """Return all lenses and slits, front to back."""
     stations: list[_Station] = []
     names = [element.part for element in system.elements]
     for number, (element, front, back) in enumerate(system.layout()):
         match element:
             case Plate():
-                if number < len(names) - 1:
+                if number < len(names) - 1 or element != sensor.window:
                     raise ValueError(
                         f"{element.part}: a plate's edges are not known, so that it cannot be held"
                     )

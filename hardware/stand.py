@@ -161,7 +161,7 @@ def stand(mount: LensMount, data: Mapping[str, Any] | None = None) -> Stand:
     }
     for name, z in legs.items():
         foot = Union((_leg(half, low, under, z, rules), *plates.get(name, ())))
-        cut = [
+        cut: list[Solid] = [
             Cylinder("y", (x, at), under - rules["core_depth"], under + 1, rules["core_hole"])
             for x, at, of in foot_screws
             if of == name

@@ -27,6 +27,7 @@ from hardware.solids import (
     Union,
     frustum,
 )
+from hardware.stand import led_mount, stand
 from raytransfer.designs import DESIGNS
 
 if TYPE_CHECKING:
@@ -82,6 +83,12 @@ def test_kernels_agree_on_mounts(name: str) -> None:
         assert brep.volume(solid) == pytest.approx(mesh.volume(solid), rel=1e-3)
     box = brep.shape(Union((mount.lower, mount.upper))).bounding_box()
     assert [*box.size] == pytest.approx(mount.size, abs=0.05)
+
+
+def test_kernels_agree_on_what_stands_around() -> None:
+    parts = stand(lens_mount(DESIGNS["thesis"].system)).parts
+    for solid in (*parts.values(), led_mount().solid):
+        assert brep.volume(solid) == pytest.approx(mesh.volume(solid), rel=1e-3)
 
 
 def test_step_reads_back_with_names(tmp_path: Path) -> None:

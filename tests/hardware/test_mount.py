@@ -131,6 +131,22 @@ def test_stl_files_pass_the_checks_too() -> None:
     assert check_mount(mount, surfaces) == []
 
 
+@pytest.mark.parametrize("name", ["thesis", "slit-f50-f100"])
+def test_halves_print_without_supports(name: str) -> None:
+    """Turned for the printer nothing hangs over but the upper sides of the board's screw holes."""
+    mount = mount_of(name)
+    screw_holes = len(mount.board.holes) / 2 * mount.rules.core_depth * mount.rules.core_hole
+    for half, solid in mount.printed().items():
+        surface = mesh(solid)
+        assert surface.volume == pytest.approx(volume(mount.halves[half]), rel=1e-9)
+        assert surface.bounds[:, 2] == pytest.approx([0, mount.half_size[1]])
+        down = surface.face_normals[:, 2] < -math.sin(math.radians(45))
+        above = surface.triangles[:, :, 2].min(axis=1) > 0.01
+        assert surface.area_faces[down & ~above].sum() > 2000  # lies on the bed
+        # seen from below, half of each hole's cylinder is a quarter turn wide
+        assert surface.area_faces[down & above].sum() < math.pi / 2 * screw_holes
+
+
 def test_used_light_starts_at_the_field_and_ends_on_the_line() -> None:
     """Rays of all eighteen LEDs are there, and none but those that the sensor can use."""
     mount = mount_of("slit-f50-f100")
@@ -181,6 +197,10 @@ def test_thinnest_wall() -> None:
                 (9.0, *THESIS.gaps),
                 0.82,
             ),
+            "edges are not known",
+        ),
+        (
+            replace(THESIS, elements=(*THESIS.elements[:-1], Plate("p", 0.7, MATERIALS["N-BK7"]))),
             "edges are not known",
         ),
         (OpticalSystem("w", (TCD1304.window,), sensor_distance=0.82), "no lens"),  # type: ignore[arg-type]

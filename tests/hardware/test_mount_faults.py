@@ -64,6 +64,12 @@ def narrow_bore() -> LensMount:
     return with_more(Box((9.0, -17.0, 20.0), (16.0, 0.0, 22.0)))
 
 
+def no_light() -> LensMount:
+    """A strip so narrow that no ray that is tried ends in it: nothing was checked."""
+    field = replace(RULES.field, strip=1e-9, across=11.9)
+    return replace(good("slit-f50-f100"), rules=replace(RULES, field=field))
+
+
 def missing_clamp_hole() -> LensMount:
     (x, z), *_ = good().screws
     return with_more(Cylinder("y", (x, z), -22.5, 0.0, 4.0))
@@ -173,6 +179,7 @@ FAULTS: list[tuple[Callable[[], LensMount], str]] = [
     (pocket_after_a_concave_shape, "insertable"),
     (blocked_light, "light"),
     (narrow_bore, "light"),
+    (no_light, "light"),
     (missing_clamp_hole, "holes"),
     (blind_clamp_hole, "holes"),
     (three_screws, "holes"),
