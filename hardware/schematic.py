@@ -7,10 +7,10 @@ by a wire, neighbouring pins of one part by a line along them; everything else b
 
 from __future__ import annotations
 
+import re
 import textwrap
 import uuid
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from hardware.boards import Terminal
@@ -39,6 +39,11 @@ def identity(*names: object) -> str:
     return str(uuid.uuid5(_NAMESPACE, "/".join(map(str, names))))
 
 
+_TOKEN: Final = re.compile(r'[()]|"(?:\\.|[^"\\])*"|"|[^\s()"]+')
+_ESCAPE: Final = re.compile(r"\\(.)")
+_MEANING: Final = {"n": "\n", '"': '"', "\\": "\\"}
+
+
 # --- KiCad's files ------------------------------------------------------------------------------
 
 
@@ -57,7 +62,8 @@ def write(item: Any, depth: int = 0) -> str:
         escaped = item.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
         return f'"{escaped}"'
     if isinstance(item, float):
-        return f"{item:.4f}".rstrip("0").rstrip(".").replace("-0", "-0" if abs(item) >= 1e-4 else "0")
+        text = f"{item:.4f}".rstrip("0").rstrip(".")
+        return "0" if text == "-0" else text
     if not isinstance(item, list):
         return str(item)
     if any(isinstance(part, list) for part in item):
@@ -78,32 +84,20 @@ def read(text: str) -> list[Any]:
         If brackets or quotes are not closed.
     """
     stack: list[list[Any]] = [[]]
-    at = 0
-    while at < len(text):
-        char = text[at]
-        if char == "(":
+    for word in _TOKEN.findall(text):
+        if word == "(":
             stack.append([])
-        elif char == ")":
+        elif word == ")":
             if len(stack) < 2:
                 raise ValueError("a bracket closes that was not opened")
             done = stack.pop()
             stack[-1].append(done)
-        elif char == '"':
-            end = at + 1
-            while text[end : end + 1] != '"':
-                if end >= len(text):
-                    raise ValueError("a quote is not closed")
-                end += 2 if text[end] == "\\" else 1
-            raw = text[at + 1 : end]
-            stack[-1].append(raw.replace("\\n", "\n").replace('\\"', '"').replace("\\\\", "\\"))
-            at = end
-        elif not char.isspace():
-            end = at
-            while end < len(text) and text[end] not in '() \t\r\n"':
-                end += 1
-            stack[-1].append(text[at:end])
-            at = end - 1
-        at += 1
+        elif word == '"':
+            raise ValueError("a quote is not closed")
+        elif word.startswith('"'):
+            stack[-1].append(_ESCAPE.sub(lambda match: _MEANING[match[1]], word[1:-1]))
+        else:
+            stack[-1].append(word)
     if len(stack) != 1 or len(stack[0]) != 1:
         raise ValueError("a bracket is not closed")
     return list(stack[0][0])
@@ -195,7 +189,9 @@ def _circle(x: float, y: float, radius: float) -> list[Any]:
     )
 
 
-def _pins(type_: PartType, places: Mapping[str, tuple[Point, Point, float]]) -> tuple[SymbolPin, ...]:
+def _pins(
+    type_: PartType, places: Mapping[str, tuple[Point, Point, float]]
+) -> tuple[SymbolPin, ...]:
     """Put the pins where their names belong."""
     return tuple(
         SymbolPin(str(number), pin.name, _ELECTRICAL[pin.function], *places[pin.name])
@@ -205,7 +201,9 @@ def _pins(type_: PartType, places: Mapping[str, tuple[Point, Point, float]]) -> 
 
 def _upright(type_: PartType, length: float, *shapes: list[Any]) -> list[Drawing]:
     """Two pins, the first above."""
-    ends = zip((pin.name for pin in type_.pins), ((0.0, 3.81), (0.0, -3.81)), (UP, DOWN), strict=True)
+    ends = zip(
+        (pin.name for pin in type_.pins), ((0.0, 3.81), (0.0, -3.81)), (UP, DOWN), strict=True
+    )
     places = {name: (at, out, length) for name, at, out in ends}
     return [Drawing(_pins(type_, places), shapes, ((2.54, 1.27), (2.54, -1.27)))]
 
@@ -298,7 +296,7 @@ def _header(type_: PartType) -> list[Drawing]:
     )
     shapes = [_rectangle(-1.27, -top - 1.27, 1.27, top + 1.27)]
     shapes += [_line((-1.27, pin.at[1]), (0.0, pin.at[1]), width=0.508) for pin in pins]
-    return [Drawing(pins, tuple(shapes), ((0.0, top + 2.54), (0.0, -top - 2.54)), names=True)]
+    return [Drawing(pins, tuple(shapes), ((0.0, top + 5.08), (0.0, top + 3.175)), names=True)]
 
 
 def _box(type_: PartType) -> list[Drawing]:
@@ -354,7 +352,9 @@ def _power(name: str) -> Drawing:
         return Drawing((pin,), tuple(shapes), ((0.0, -5.08), (0.0, -3.81)))
     if name == "PWR_FLAG":
         shapes = [
-            _line((0.0, 0.0), (0.0, 1.27), (-1.016, 1.905), (0.0, 2.54), (1.016, 1.905), (0.0, 1.27))
+            _line(
+                (0.0, 0.0), (0.0, 1.27), (-1.016, 1.905), (0.0, 2.54), (1.016, 1.905), (0.0, 1.27)
+            )
         ]
     else:
         shapes = [
@@ -466,17 +466,40 @@ def _turn(point: Point, degrees: int) -> Point:
     return (x, y)
 
 
-def value(type_: PartType) -> str:
-    """Return what a part's value is called on schematic and board."""
+def value(board: Board, part: Part) -> str:
+    """Return what is written at a part on schematic and board: its value, or what is plugged in."""
+    if part.reference in board.connectors:
+        return board.connectors[part.reference].to
+    text = part.type.type
     for noun in (" resistor", " capacitor", " transistor"):
-        if noun in type_.type:
-            return type_.type.replace(noun, "")
-    return type_.type
+        text = text.replace(noun, "")
+    return text
 
 
 def fitted(board: Board, part: Part) -> bool:
     """Whether a part is fitted in the assembly that was built."""
     return part.only in {"", board.assemblies[0]}
+
+
+def net_names(board: Board) -> dict[Terminal, str]:
+    """Return what KiCad calls the net of each pin.
+
+    Names of supplies hold everywhere, others on their sheet; a pin without a net has one of its own.
+    """
+    supplies = supply_nets(board)
+    names = {
+        end: net if net in supplies else f"/{net}"
+        for net, ends in board.nets.items()
+        for end in ends
+    }
+    for reference, part in board.parts.items():
+        drawn = drawings(part.type)
+        for unit, drawing in enumerate(drawn):
+            letter = chr(ord("A") + unit) if len(drawn) > 1 else ""
+            for pin in drawing.pins:
+                alone = f"unconnected-({reference}{letter}-{pin.name}-Pad{pin.number})"
+                names.setdefault(Terminal(reference, pin.number), alone)
+    return names
 
 
 def supply_nets(board: Board) -> set[str]:
@@ -523,6 +546,12 @@ def _along(pin: PlacedPin, length: float) -> Point:
         round(pin.at[0] + pin.out[0] * length, 4),
         round(pin.at[1] + pin.out[1] * length, 4),
     )
+
+
+def _middle(a: Point, b: Point, back: float) -> Point:
+    """Return the point of KiCad's grid nearest to the middle of a wire, moved left."""
+    x, y = (a[0] + b[0]) / 2 - back, (a[1] + b[1]) / 2
+    return (round(1.27 * round(x / 1.27), 4), round(1.27 * round(y / 1.27), 4))
 
 
 def _between(a: Point, b: Point, point: Point) -> bool:
@@ -664,7 +693,7 @@ class Sheet:
         self.library.setdefault(name, _library_symbol(name, [drawing], power=True))
         natural = (0.0, 1.0) if net == "GND" else (0.0, -1.0)
         degrees = 180 if out == (-natural[0], -natural[1]) else 0
-        x, y = _turn(drawing.texts[1], degrees)
+        above = _turn(drawing.texts[1], degrees)[1]
         self._count += 1
         reference = f"{'#FLG' if net == 'PWR_FLAG' else '#PWR'}{self._count:03d}"
         self._instance(
@@ -673,7 +702,7 @@ class Sheet:
             at,
             degrees,
             identity(self.board.name, reference),
-            {"Reference": (reference, at, False), "Value": (net, (at[0], at[1] - y), True)},
+            {"Reference": (reference, at, False), "Value": (net, (at[0], at[1] - above), True)},
             ["1"],
             on_board=False,
         )
@@ -691,6 +720,10 @@ class Sheet:
                 self._wire(a.at, b.at)
         joined = {(pin.terminal, other.at) for a, b in pairs for pin, other in ((a, b), (b, a))}
         supplies = supply_nets(board)
+        beside: dict[tuple[str, Point], list[str]] = {}
+        for pin in pins:
+            if pin.out[1] == 0:
+                beside.setdefault((pin.terminal.reference, pin.out), []).append(pin.net)
         for members in _clusters(pins, pairs):
             net = members[0].net
             if not net:
@@ -700,24 +733,28 @@ class Sheet:
                 pin
                 for pin in members
                 if not any(
-                    end == pin.terminal and _along(pin, abs(at[0] - pin.at[0]) + abs(at[1] - pin.at[1])) == at
+                    end == pin.terminal
+                    and _along(pin, abs(at[0] - pin.at[0]) + abs(at[1] - pin.at[1])) == at
                     for end, at in joined
                 )
             ]
             if net in supplies:
                 natural = (0.0, 1.0) if net == "GND" else (0.0, -1.0)
                 pin = min(free or members, key=lambda pin: pin.out != natural)
-                end = _along(pin, 2.54)
+                in_row = len(beside.get((pin.terminal.reference, pin.out), ())) > 1
+                past = 10.16 if in_row else 5.08 if pin.out[1] == 0 else 2.54  # names beside it
+                end = _along(pin, past)
                 self._wire(pin.at, end)
                 self._tag(net, end, pin.out)
             elif free:
                 pin = free[0]
-                length = 2.54 * -(-len(net) * 1.1 // 2.54)
-                self._wire(pin.at, _along(pin, length))
-                self._label(net, pin.at, pin.out)
+                end = _along(pin, 2.54 * -(-len(net) * 1.1 // 2.54))
+                self._wire(pin.at, end)
+                self._label(net, end, (-pin.out[0], -pin.out[1]))  # the text lies on the wire
             else:
-                pin = members[0]
-                self._label(net, pin.at, pin.out if pin.out[1] == 0 else (0.0, -1.0))
+                a, b = next(pair for pair in pairs if pair[0] in members)
+                back = 0.55 * len(net) if a.at[1] == b.at[1] else 0.0
+                self._label(net, _middle(a.at, b.at, back), (1.0, 0.0))
         self._flags(supplies)
         x, y = self.layout["schematic"]["notes"]
         self._text(_notes(board), (2.54 * x, 2.54 * y))
@@ -725,16 +762,15 @@ class Sheet:
     def _unit(self, unit: Unit) -> None:
         part, name = unit.part, symbol_name(unit.part)
         self.library.setdefault(name, _library_symbol(name, drawings(part.type)))
-        plug = self.board.connectors.get(part.reference)
         below = unit.drawing.texts
         if unit.rotation in {90, 270}:  # beside an upright symbol becomes above a lying one
-            texts = [(unit.at[0], unit.at[1] - 3.302), (unit.at[0], unit.at[1] + 3.302)]
+            texts = [(unit.at[0], unit.at[1] - 4.191), (unit.at[0], unit.at[1] - 2.286)]
         else:
             texts = [(unit.at[0] + x, unit.at[1] - y) for x, y in below]
         gate = len(drawings(part.type)) > 1 and len(unit.drawing.pins) == 2 and unit.number > 1
         fields = {
             "Reference": (part.reference, texts[0], True),
-            "Value": (plug.to if plug else value(part.type), texts[1], not gate),
+            "Value": (value(self.board, part), texts[1], not gate),
             "Footprint": (part.type.footprint, unit.at, False),
             "Datasheet": ("", unit.at, False),
             "Description": (part.note, unit.at, False),
@@ -761,8 +797,8 @@ class Sheet:
             and any(name in self.board.supplies for _, name, _ in netlist.labels(net))
         ]
         for n, net in enumerate(brought):
-            at = (2.54 * (x + 5 * n), 2.54 * y)
-            end = (at[0] + 5.08, at[1])
+            at = (2.54 * (x + 7 * n), 2.54 * y)
+            end = (at[0] + 10.16, at[1])
             self._wire(at, end)
             self._tag(net, at, (0.0, 1.0) if net == "GND" else (0.0, -1.0))
             self._tag("PWR_FLAG", end, (0.0, -1.0))
@@ -792,7 +828,10 @@ def _notes(board: Board) -> str:
     for change in board.changes:
         lines += ["", *textwrap.wrap(f"Removes “{change.removes}”: {change.why}.", 100)]
     for assembly, *ends in board.wires:
-        lines += ["", f"Built as “{assembly}”: a wire joins {ends[0]} and {ends[1]}; crossed-out parts are left out."]
+        lines += [
+            "",
+            f"Built as “{assembly}”: a wire joins {ends[0]} and {ends[1]}; crossed-out parts are left out.",
+        ]
     return "\n".join(lines)
 
 
