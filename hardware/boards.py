@@ -77,8 +77,8 @@ class PartType:
     type : str
         As bills of materials call it.
     kind : str
-    package, symbol, footprint : str
-        The last two are names of KiCad's libraries; a symbol may be empty.
+    package, footprint : str
+        The footprint is a name of KiCad's libraries.
     pins : tuple of PartPin
         Pin 1 first.
     value : float or None
@@ -94,7 +94,6 @@ class PartType:
     package: str
     footprint: str
     pins: tuple[PartPin, ...]
-    symbol: str = ""
     value: float | None = None
     price: Decimal | None = None
     limits: Mapping[str, Any] = field(default_factory=dict)

@@ -67,11 +67,11 @@ def layout_of(board: Board) -> dict[str, Any]:
 def outline(placed: Mapping[str, Any]) -> dict[str, Any]:
     """Return size, corner, holes and thickness of a board, mm; frame as in its layout."""
     data = mechanics()
-    where = placed["board"]["outline"]
-    if isinstance(where, dict):
-        return {"corner": (0.0, 0.0), "thickness": data["sensor_board"]["thickness"], **where}
-    entry = data[where]
-    return {**entry, "corner": tuple(-side / 2 for side in entry["size"])}
+    sensor, where = data["sensor_board"], placed["board"]["outline"]
+    if where == "sensor_board":
+        return {**sensor, "corner": tuple(-side / 2 for side in sensor["size"])}
+    alike = {name: sensor[name] for name in ("thickness", "hole_diameter")}
+    return {**alike, **data["boards"][where], "corner": (0.0, 0.0)}
 
 
 def job(board: Board, placed: Mapping[str, Any], output: Path) -> dict[str, Any]:
