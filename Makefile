@@ -1,4 +1,4 @@
-# make setup | run | test | lab | bench | agreement | notebooks | soak | flash | lint | lock | clean
+# make setup | run | test | lab | bench | agreement | notebooks | soak | flash | pcb | lint | lock | clean
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -7,7 +7,7 @@ BENCH := .venv-bench
 BENCH_STAMP := $(BENCH)/.complete
 INPUTS := environment.txt constraints.txt pyproject.toml
 
-.PHONY: help setup build run test lint lab notebooks bench agreement soak flash lock clean
+.PHONY: help setup build run test lint lab notebooks bench agreement soak flash pcb lock clean
 
 help:
 	@echo "make setup      build $(VENV) from environment.txt, install the project, compile firmware and twin"
@@ -18,6 +18,7 @@ help:
 	@echo "make bench      speed, beside other packages; table and build/bench.json"
 	@echo "make agreement  exact rays beside two other tracers, ray by ray"
 	@echo "make soak       link faults, tracking for 10 min through the firmware and for 24 h: takes hours"
+	@echo "make pcb        the boards' KiCad projects, written again and checked with KiCad 9"
 	@echo "make flash      copy the firmware to a Nucleo that is plugged in"
 
 # install FOLDER, ARGUMENTS: uv where it can be had (faster), pip otherwise
@@ -91,6 +92,10 @@ soak: setup
 
 flash: setup
 	@$(MAKE) --no-print-directory -C firmware flash
+
+# needs kicad-cli 9: apt install -t bookworm-backports kicad
+pcb: setup
+	$(BIN)/python -m pytest tests/hardware/pcb.py
 
 # --universal: one file for x86_64 and aarch64, Python 3.11 to 3.13
 lock: setup
