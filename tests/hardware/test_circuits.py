@@ -7,6 +7,7 @@ import os
 import shutil
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,6 +28,8 @@ from hardware.circuits import (
     simulate,
 )
 from hardware.electrical import check_board
+
+README = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
 
 needs_ngspice = pytest.mark.skipif(
     shutil.which("ngspice") is None and not os.environ.get("CI"),
@@ -210,3 +213,27 @@ def test_assumptions_are_named() -> None:
         assert name in text
     assert text.count("assumed") >= 5
     assert "nothing has been measured" in text
+
+
+@needs_ngspice
+@pytest.mark.parametrize(
+    ("row", "kind", "what", "unit"),
+    [
+        ("highest voltage at the ADC", "tcd1304", "highest dark level", "V"),
+        ("level that the inverter takes for high", "tcd1304", "fM is surely high from", "V"),
+        ("drain of an LED's transistor", "led-driver", "drain at switch-off", "V"),
+        ("LED current to 99 %", "led-driver", "rises to 99 %", "µs"),
+        ("the sensor's output to 1 %", "tcd1304", "sensor's output 1000 Ω", "µs"),
+    ],
+)
+def test_readme_says_what_is_simulated(row: str, kind: str, what: str, unit: str) -> None:
+    (line,) = (line for line in README.splitlines() if line.startswith(f"| {row}"))
+    scale = {"V": 1.0, "µs": 1e-6}[unit]
+    for name, cell in zip((kind, f"{kind}-improved"), line.split("|")[2:4], strict=True):
+        number, its_unit = cell.split()
+        assert its_unit == unit
+        # half of the last digit, and what one release of ngspice differs from another
+        least = 10.0 ** -len(number.partition(".")[2])
+        assert float(number) * scale == pytest.approx(
+            value(name, what), abs=0.6 * least * scale, rel=0.005
+        )

@@ -53,6 +53,7 @@ def test_linetrack_commands_run(tmp_path: Path) -> None:
         "live",
         "convert",
         "track",
+        "build",
     }
     for line in lines:
         words = shlex.split(line)
@@ -61,7 +62,7 @@ def test_linetrack_commands_run(tmp_path: Path) -> None:
             words += ["--frames", "4"]  # or it waits for a key
         elif words[1] == "track" and not {"-n", "--count"} & set(words):
             words += ["--count", "4"]  # or it follows for ever
-        subprocess.run(words, cwd=tmp_path, check=True, capture_output=True, timeout=120)
+        subprocess.run(words, cwd=tmp_path, check=True, capture_output=True, timeout=300)
 
 
 def test_every_notebook_is_listed() -> None:
