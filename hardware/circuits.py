@@ -282,12 +282,29 @@ def _settling(netlist: Netlist) -> Iterator[Measurement]:
         )
 
 
+def converter_input(netlist: Netlist) -> NDArray[np.float64]:
+    """Voltage at the converter, for voltages of the sensor's output.
+
+    Parameters
+    ----------
+    netlist : Netlist
+        Of a sensor's board.
+
+    Returns
+    -------
+    ndarray, shape (2, N)
+        The sensor's, the converter's, V.
+    """
+    (sensor,) = netlist.of_kind("sensor")
+    deck = _sensor_deck(netlist, "0", min(sensor.type.limits["output_ohm"]))
+    os = f"v({_node(_labelled(netlist, 'OS'))})"
+    return simulate(deck, "dc Vsensor 0.5 4 0.01", [os])
+
+
 def _converter(netlist: Netlist) -> Iterator[Measurement]:
     (sensor,) = netlist.of_kind("sensor")
     dark, swing = sensor.type.limits["dark"], sensor.type.limits["swing"]
-    deck = _sensor_deck(netlist, "0", min(sensor.type.limits["output_ohm"]))
-    os = f"v({_node(_labelled(netlist, 'OS'))})"
-    sweep, wave = simulate(deck, "dc Vsensor 0.5 4 0.01", [os])
+    sweep, wave = converter_input(netlist)
     names = ("least", "typical", "highest")
     for name, level in zip(names, dark, strict=True):
         yield Measurement(
@@ -341,20 +358,37 @@ def _logic_level(netlist: Netlist) -> Iterator[Measurement]:
         )
 
 
+def led_pulse(netlist: Netlist, factor: float = 1.0) -> NDArray[np.float64]:
+    """Switch the first LED on and off.
+
+    Parameters
+    ----------
+    netlist : Netlist
+        Of a board that switches LEDs.
+    factor : float
+        Of the supply's voltage.
+
+    Returns
+    -------
+    ndarray, shape (3, N)
+        Time since it was switched on, s; the LED's current, A; voltage at the transistor's drain.
+    """
+    led = netlist.board.leds[0]
+    drain = f"v({_node(netlist.at(_switch(netlist, led), 'D'))})"
+    vectors = [f"i(v{led.reference})", drain]
+    pulse = simulate(_led_deck(netlist, factor), f"tran 50n {_END} 0 50n", vectors)
+    pulse[0] -= _ON
+    return pulse
+
+
 def _led(netlist: Netlist) -> Iterator[Measurement]:
     led = netlist.board.leds[0]
     switch = _switch(netlist, led)
-    vectors = [f"i(v{led.reference})", f"v({_node(netlist.at(switch, 'D'))})"]
-    supplied = [
-        simulate(_led_deck(netlist, factor), f"tran 50n {_END} 0 50n", vectors)
-        for factor in (
-            1.0,
-            1 - SURROUNDINGS["supply"]["tolerance"],
-            1 + SURROUNDINGS["supply"]["tolerance"],
-        )
-    ]
+    tolerance = SURROUNDINGS["supply"]["tolerance"]
+    supplied = [led_pulse(netlist, factor) for factor in (1.0, 1 - tolerance, 1 + tolerance)]
     time, current, drain = supplied[0]
-    on = (time >= _ON) & (time < _OFF)
+    lasting = _OFF - _ON
+    on = (time >= 0) & (time < lasting)
     full = float(current[on][-1])
     rise = settled(time[on], current[on])
     quick = [float(time[on][np.argmax(current[on] >= share * full)]) for share in (0.1, 0.9)]
@@ -388,14 +422,14 @@ def _led(netlist: Netlist) -> Iterator[Measurement]:
         "rise", "LED current rises from 10 to 90 %", quick[1] - quick[0], "s", math.nan, place
     )
     for span in (SHORTEST_INTEGRATION, SURROUNDINGS["integration"]["thesis"]):
-        lit = (time >= _ON) & (time <= _ON + span)
+        lit = (time >= 0) & (time <= span)
         share = float(np.trapezoid(current[lit], time[lit])) / (full * span)
         what = f"light of {span * 1e6:g} µs, of what full current would give"
         yield Measurement("light", what, share, "", math.nan, place)
-    low, high = (float(c[(t >= _ON) & (t < _OFF)][-1]) for t, c, _ in supplied[1:])
+    low, high = (float(c[(t >= 0) & (t < lasting)][-1]) for t, c, _ in supplied[1:])
     yield Measurement(
         "series resistor",
-        f"LED current's change for ± {100 * SURROUNDINGS['supply']['tolerance']:g} % of the supply",
+        f"LED current's change for ± {100 * tolerance:g} % of the supply",
         (high - low) / 2 / full,
         "",
         limits["change"],
@@ -405,7 +439,7 @@ def _led(netlist: Netlist) -> Iterator[Measurement]:
     yield Measurement(
         "flyback path",
         "transistor's drain at switch-off, at most",
-        float(drain[time >= _OFF].max()),
+        float(drain[time >= lasting].max()),
         "V",
         limits["derating"] * switch.type.limits["drain_source"],
         switch.reference,

@@ -23,12 +23,12 @@ from hardware.electrical import check_board
 from hardware.mesh import bounds, manifold, volume
 from hardware.mount import mechanics
 from hardware.package import LEDS, Fault, overhang
-from hardware.render import BOARD, GLASS, PLASTIC, Shown, exploded, picture
-from hardware.solids import Cylinder, Placed
+from hardware.render import exploded, on_pole, picture, standing
+from hardware.solids import Placed
 from raytransfer.lenses import Lens, SphericalLens
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from hardware.mount import LensMount
     from hardware.package import Plan
     from hardware.solids import Solid
-    from hardware.stand import Stand
 
 LAYER: Final = 0.15
 """Layer height that the thesis printed with (section 4.4.1), mm."""
@@ -45,7 +44,6 @@ LAYER: Final = 0.15
 _PLA: Final = 1.24e-3  # density, g/mm³
 _SUPPORT: Final = 100.0  # mm² in the air from which on a slicer should be let make supports
 _TOGETHER: Final = 16  # rows of a table that is not cut by the end of a page
-_ALUMINIUM: Final = (0.66, 0.68, 0.71)
 
 
 def page(plan: Plan, files: Sequence[str]) -> str:
@@ -136,7 +134,7 @@ def _overview(plan: Plan) -> str:
 {_table((), rows)}
 <div class="pair">
 {_figure(picture(exploded(mount, 24.0), pixels=640), "The head taken apart. Light comes from the right front.")}
-{_figure(picture(_standing(plan), azimuth=215.0, elevation=35.0, pixels=760), "Head, computers and LED board on the stand, from behind.")}
+{_figure(picture(standing(plan.stand), azimuth=215.0, elevation=35.0, pixels=760), "Head, computers and LED board on the stand, from behind.")}
 </div>
 <h3>Lenses, in the order in which light meets them</h3>
 {_table(("No.", "Lens", "How it lies", "Thick, mm", "Above cover, mm"), table, "lllnn")}
@@ -338,11 +336,7 @@ def _assembly(plan: Plan) -> str:
         items = "".join(f"<li>{escape(step)}</li>" for step in steps)
         text += f'<h3>{title}</h3>\n<ol class="steps" style="--from: {number}">{items}</ol>\n'
         number += len(steps)
-    pole = Cylinder("z", (0.0, 0.0), -25.0, 55.0, plan.led.rules["pole"])
-    image = picture(
-        [Shown(plan.led.solid, PLASTIC), Shown(pole, _ALUMINIUM)],
-        azimuth=40.0, elevation=20.0, pixels=420,
-    )  # fmt: skip
+    image = picture(on_pole(plan.led), azimuth=40.0, elevation=20.0, pixels=420)
     return text + _figure(image, "LED mount on its pole; LED and heat sink go on the flat plate.")
 
 
@@ -527,16 +521,6 @@ def _file_list(files: Sequence[str]) -> str:
 
 
 # --- pictures -------------------------------------------------------------------------------------
-
-
-def _standing(plan: Plan) -> list[Shown]:
-    around: Stand = plan.stand
-    mount = around.mount
-    parts = [Shown(solid, PLASTIC) for solid in (*around.parts.values(), *mount.halves.values())]
-    parts += [Shown(lens.glass, GLASS) for lens in mount.lenses]
-    parts += [Shown(board.slab(), BOARD) for board in around.boards]
-    sensor: Mapping[str, Solid] = mount.board.parts(mount.face)
-    return [*parts, Shown(sensor["board"], BOARD)]
 
 
 def section(mount: LensMount) -> str:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from hardware.mesh import manifold, trimesh_of
+from hardware.solids import Cylinder
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -16,11 +17,13 @@ if TYPE_CHECKING:
 
     from hardware.mount import LensMount
     from hardware.solids import Point, Solid
+    from hardware.stand import LedMount, Stand
 
 PLASTIC = (0.87, 0.85, 0.80)
 GLASS = (0.45, 0.66, 0.85)
 BOARD = (0.16, 0.45, 0.28)
 PACKAGE = (0.25, 0.25, 0.28)
+ALUMINIUM = (0.66, 0.68, 0.71)
 _LIGHT = np.array([-0.35, 0.55, 0.76])  # to the left of the eye, above and behind it
 
 
@@ -63,6 +66,21 @@ def exploded(mount: LensMount, apart: float = 30.0) -> list[Shown]:
             colour = BOARD if name == "board" else PACKAGE
             parts.append(Shown(solid, colour, (0.0, 0.0, apart / 2)))
     return parts
+
+
+def standing(stand: Stand) -> list[Shown]:
+    """Return the motherboard with the head and all boards on it."""
+    mount = stand.mount
+    parts = [Shown(solid, PLASTIC) for solid in (*stand.parts.values(), *mount.halves.values())]
+    parts += [Shown(lens.glass, GLASS) for lens in mount.lenses]
+    parts += [Shown(board.slab(), BOARD) for board in stand.boards]
+    return [*parts, Shown(mount.board.parts(mount.face)["board"], BOARD)]
+
+
+def on_pole(mount: LedMount) -> list[Shown]:
+    """Return an LED's mount on its pole."""
+    pole = Cylinder("z", (0.0, 0.0), -25.0, 55.0, mount.rules["pole"])
+    return [Shown(mount.solid, PLASTIC), Shown(pole, ALUMINIUM)]
 
 
 def picture(
