@@ -139,6 +139,7 @@ def minutes(count: float, seed: int, *, spikes: bool) -> Generator[Report]:
                     break
                 if report.seconds > 60 * (told + 1):
                     told += 1
+                    report.growth = resident() - size
                     yield report
                 if link.fault is None:
                     chance = random.random() / period
