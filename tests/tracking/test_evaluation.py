@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import matplotlib as mpl
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -149,8 +150,9 @@ def test_plot_says_what_the_numbers_say() -> None:
     ax = Figure().subplots()
     assert plot_jitter(samples, ax, width=0.2, label="x, at rest") is ax
     found = jitter(samples)
-    assert f"µ = {found.mean:.3g} mm, σ = {found.sigma:.3g} mm" in ax.get_title().replace("−", "-")
-    assert "x, at rest" in ax.get_title()
+    title = ax.get_title(loc=mpl.rcParams["axes.titlelocation"]).replace("−", "-")
+    assert f"µ = {found.mean:.3g} mm, σ = {found.sigma:.3g} mm" in title
+    assert "x, at rest" in title
     (stairs,) = ax.patches[:1]
     assert stairs.get_data().values.sum() == 93  # type: ignore[attr-defined]
     assert "93" in ax.get_ylabel()

@@ -41,7 +41,8 @@ ICG_PERIODS = {False: 16_000, True: 14_800}
 
 DARK_EVERY, DARK = 8.0, (0.1, 0.9)  # s; someone stands before everything, and for how long
 LINK_FAULT_EVERY, DEVICE_FAULT_EVERY = 1.0, 15.0  # s, on average
-WARM = 20.0  # s; tables of light and caches fill
+WARM = 20.0  # s
+LIGHT_EVERY = 0.25  # s of the walk for which light is computed beforehand: its tables are then full
 
 
 class Room:
@@ -122,6 +123,9 @@ def minutes(count: float, seed: int, *, spikes: bool) -> Generator[Report]:
     icg_period = ICG_PERIODS[spikes]
     period = icg_period / 4e6
     size, locked, told = 0, False, 0
+    for seconds in np.arange(0.0, 60 * count, LIGHT_EVERY).tolist():
+        for _ in room.world.lit(seconds):
+            pass
     with FaultyLink(seed, world=room.world) as link:
         clock = Clock(link)
         tracker = Tracker(room.calibration, schedule=default_schedule(LEDS, icg_period=icg_period))
