@@ -309,6 +309,7 @@ class MotionFilter:
         self._doubts = 0  # a bit for each measurement, 1 if the pose was unchecked
         self._unchecked = False  # the pose: too few LEDs speak for it …
         self._witnesses: frozenset[int] = frozenset()  # … and these
+        self._speakers = 0  # how many of them would have told if it were wrong
         self._refused: set[int] = set()  # since any spike was believed
         self.lost = True
         self.losses = 0
@@ -730,10 +731,11 @@ class MotionFilter:
             if outcome is Outcome.USED:
                 self._used_ns = t_ns
                 self._to_confirm -= 1
-                if scale - variance <= DOUBT**2:
-                    self._witnesses |= {row}
+                # the pose has followed what was easy to please: that LED cannot speak for it later
+                self._speakers += row not in self._witnesses and scale - variance <= DOUBT**2
+                self._witnesses |= {row}
                 if not self._to_confirm:
-                    self._lock(unchecked=len(self._witnesses) <= NEEDED)
+                    self._lock(unchecked=self._speakers <= NEEDED)
                     self._flags = _RELOCALISED
             elif self._tries >= 2 * CONFIRMATIONS:
                 self._to_confirm = 0
@@ -834,6 +836,7 @@ class MotionFilter:
             self._begin(self._t, state, covariance)
             self._seen = {int(rows[-1])}
             self._witnesses = frozenset(rows[use].tolist())
+            self._speakers = len(self._witnesses)
             return True
         return False
 

@@ -245,6 +245,9 @@ class Schedule:
         self._turn = 0
         self._rows = {channel: row for row, channel in enumerate(leds.channels)}
         self._fluxes: NDArray[np.float64] = np.zeros(len(leds))
+        apart_mm = np.linalg.norm(leds.positions[:, None] - leds.positions, axis=2)
+        np.fill_diagonal(apart_mm, -1.0)
+        self._nearness = 1.0 / np.maximum(apart_mm.argsort(axis=1).argsort(axis=1), 1)
 
     def sequence(self, motion: MotionFilter, t_ns: int, frames: int) -> list[dict[int, int]]:
         """Plan frames.
@@ -358,6 +361,8 @@ class Schedule:
             )
             likely *= self._fluxes > 0
         found = (self._chances == 1.0) & (seconds - self._judged < self._forgetting / 2)
+        if found.any():
+            likely = np.maximum(likely, self._nearness[found].max(axis=0))
         weight = np.where(found, 1.0, np.maximum(likely, ELSEWHERE) * self.chances(seconds))
         lit = self._lit.copy()
         plan = []

@@ -92,6 +92,7 @@ _ODD = SpikeFlags.MISSING.value | _UNCERTAIN
 _KEPT = PoseFlags.INCONSISTENT | PoseFlags.UNCHECKED
 _USUAL = 1.6  # times the mean width: wider is unusual
 _LEAST = 0.15  # of a lamp's height by which its light may have changed
+_PARALLEL = 0.1  # rad between the facings of a wall's LEDs
 _APART = 1.0  # widths: spikes of one frame that are nearer cannot be told apart
 
 
@@ -442,8 +443,8 @@ class Tracker:
     def _sought(self, frame: Frame | SpikeFrame) -> dict[int, Spike]:
         """Spikes of the whole line: the strongest, as many as LEDs are lit.
 
-        Several at once are told apart by their order only: LEDs of a line, seen from its front,
-        have that of their x.
+        Several at once are told apart by their order only: LEDs of a wall, seen from its front,
+        have that of their place along it. Of different walls, it depends on where one stands.
         """
         channels = frame.channels
         if not channels:
@@ -451,10 +452,14 @@ class Tracker:
         found = self._whole_line(frame)[: len(channels)]
         if len(channels) == 1:
             return {channels[0]: found[0] if found else MISSING}
-        if len(found) < len(channels):
+        rows = [self.leds.index(n) for n in channels]
+        facings = self.leds.facings[rows]
+        if len(found) < len(channels) or np.ptp(facings) > _PARALLEL:
             return {}
         turned = self.calibration.camera.scale < 0
-        along = sorted(channels, key=lambda n: self.leds.positions[self.leds.index(n), 0])
+        wall = np.array([math.cos(facings[0]), math.sin(facings[0])])
+        order = np.argsort(self.leds.positions[rows, :2] @ wall, kind="stable")
+        along = [channels[i] for i in order]
         spikes = sorted(found, key=lambda spike: spike.position, reverse=turned)
         return dict(zip(along, spikes, strict=True))
 

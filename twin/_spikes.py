@@ -138,12 +138,13 @@ def expose(
 ):
     """What a finder says of a frame in which the LEDs `rows` are lit for `seconds`.
 
-    One row of out for each window: position, sigma, width, height, flags. Draws has a row of random
-    numbers for each LED, two normal ones and three from 0 to 1.
+    One row of out for each window, the strongest there: position, sigma, width, height, flags. With
+    no windows those of the line, by falling height. Draws has a row of random numbers for each LED,
+    two normal ones and three from 0 to 1.
     """
     count = len(rows)
     fields = np.empty(5)
-    # what there is to be found: position, error, stated sigma, width, height, flags, LED
+    # what there is to be found: position, sigma, width, height seen, flags, height, 1 once told
     there = np.empty((2 * count + 1, 7))
     found = 0
     for k in range(count):
@@ -188,7 +189,7 @@ def expose(
             row[3] = seen
             row[4] = flags
             row[5] = height
-            row[6] = kind
+            row[6] = 0.0
             found += 1
     # spikes that touch are one
     for i in range(found):
@@ -209,13 +210,18 @@ def expose(
         out[k, 4] = MISSING
         best, second = -1, -1
         for i in range(found):
-            if there[i, 5] > 0.0 and windows[k, 0] <= there[i, 0] <= windows[k, 1]:
+            if there[i, 5] > 0.0 and (
+                there[i, 6] == 0.0
+                if len(windows) == 0
+                else windows[k, 0] <= there[i, 0] <= windows[k, 1]
+            ):
                 if best < 0 or there[i, 5] > there[best, 5]:
                     best, second = i, best
                 elif second < 0 or there[i, 5] > there[second, 5]:
                     second = i
         if best < 0:
             continue
+        there[best, 6] = 1.0
         out[k, :4] = there[best, :4]
         flags = int(there[best, 4])
         if second >= 0 and abs(there[best, 0] - there[second, 0]) < 4.0 * there[best, 2]:

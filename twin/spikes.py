@@ -456,16 +456,15 @@ class SpikeWorld:
         Returns
         -------
         dict of int to Spike
-            One for each LED lit: the strongest in its window, whoever's it is.
+            One for each LED lit: the strongest in its window, whoever's it is; without windows the
+            strongest of the line, the second, and so on.
         """
         if not lit:
             return {}
         rows = np.array([self._rows[channel] for channel in lit], np.int64)
         seconds = np.array([clocks / self._clock for clocks in lit.values()])
-        if windows is None:
-            limits = np.full((len(rows), 2), [0.0, self._last])
-        else:
-            limits = np.array([windows[channel] for channel in lit], float).reshape(-1, 2)
+        places = [] if windows is None else [windows[channel] for channel in lit]
+        limits = np.array(places, float).reshape(-1, 2)
         out = np.empty((len(rows), 5))
         self._kernels.expose(
             self._seed,
