@@ -9,7 +9,7 @@ from scipy.stats import chi2  # type: ignore[import-untyped]
 from tracking.camera import Camera
 from tracking.evaluation import nees, nees_band
 from tracking.leds import LedMap
-from tracking.motion import CONFIRMATIONS, MANY, SQUARED, MotionFilter, Outcome, load_kernels
+from tracking.motion import CONFIRMATIONS, DOUBT, MANY, SQUARED, MotionFilter, Outcome, load_kernels
 from tracking.poses import Fix, PoseFlags, Prior, optical
 from tracking.spikes import Spike, SpikeFlags
 
@@ -732,6 +732,30 @@ def test_three_leds_are_unchecked_until_a_fourth_agrees() -> None:
     estimate = motion.observe((n + 2) * FRAME, frame(pose, random, further))
     assert not motion.unchecked
     assert estimate.flags == PoseFlags.NONE
+
+
+def test_an_led_that_was_easy_to_please_does_not_vouch_for_a_pose() -> None:
+    """While a pose is confirmed, what is taken in after a pause passes wherever it nearly is."""
+    motion, random = MotionFilter(CAMERA, LEDS), np.random.default_rng(9)
+    pose = (50.0, 2500.0, 0.02)
+    rows = on_line(pixels(pose))
+    seen, fourth = rows[[0, 2, 4]], rows[[1]]
+    n = 0
+    while not np.isfinite(motion.covariance).all():
+        n += 1
+        motion.observe(n * FRAME, frame(pose, random, seen[[n % 3]]))
+    n += 12  # of 4 ms
+    motion.observe(n * FRAME, frame(pose, random, fourth))
+    (innovation,) = (i for i in motion.innovations if i.channel == LEDS.channels[fourth[0]])
+    assert innovation.outcome is Outcome.USED
+    assert innovation.sigma > 2 * DOUBT
+    for _ in range(20):
+        n += 1
+        motion.observe(n * FRAME, frame(pose, random, [seen[n % 3], fourth[0]]))
+    assert not motion.lost
+    assert motion.unchecked
+    motion.observe((n + 1) * FRAME, frame(pose, random, rows[[3]]))
+    assert not motion.unchecked
 
 
 def test_a_lone_spike_after_darkness_is_unchecked() -> None:

@@ -166,6 +166,27 @@ def test_before_any_pose_leds_found_are_lit_more_often() -> None:
     assert len({*lit[60:]} - seen) > 5  # something else may be in sight soon
 
 
+def test_search_lights_neighbours_of_what_was_found() -> None:
+    """The tracker was turned in the dark: where it looked before, there is nothing any more."""
+    motion = at((500.0, -200.0, 0.7))
+    expected = motion.expected()
+    unseen = [n for n, seen in zip(expected.channels, expected.visible, strict=True) if not seen]
+    middle = unseen[len(unseen) // 2]
+    motion.lost, motion.losses = True, 1
+    schedule, lit = PredictedVisible(ROOM, SH_PERIOD, ICG_PERIOD, latency=0), []
+    for number in range(200):
+        t_ns = number * ICG_PERIOD * 250
+        ((channel, clocks),) = schedule.sequence(motion, t_ns, 1)[0].items()
+        lit.append(channel)
+        found = spike() if channel == middle else missing()
+        schedule.observe(t_ns, {channel: clocks}, {channel: found})
+    counts = np.bincount(lit[lit.index(middle) :], minlength=40)
+    near = [(middle + step) % 40 for step in (-2, -1, 1, 2)]
+    far = [n for n in unseen if min(abs(n - middle), 40 - abs(n - middle)) > 5]
+    assert counts[near].mean() > 2 * counts[far].mean()
+    assert counts[far].min() > 0
+
+
 def test_before_any_pose_exposures_are_sought_by_each_led() -> None:
     """Long, medium, short until it is found; then as it needs; long again when it is gone."""
     schedule = RoundRobin(LedMap.line(2, 500.0), 400, ICG_PERIOD)

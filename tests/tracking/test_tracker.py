@@ -465,6 +465,41 @@ def test_several_leds_from_the_first_frame_on() -> None:
     assert np.abs(room.errors(steps)).max(axis=0)[:2].max() < 3
 
 
+@pytest.mark.parametrize("turn", [0.0, math.pi / 2, math.pi, -2.0])
+def test_several_leds_are_told_apart_on_any_wall(turn: float) -> None:
+    """Their order is that along the wall, not that of x."""
+    sin, cos = math.sin(turn), math.cos(turn)
+
+    def turned(x: float, y: float) -> tuple[float, float]:
+        return x * cos - y * sin, x * sin + y * cos
+
+    wall = LedMap(range(4), [turned(x, 0.0) for x in (-600.0, -100.0, 300.0, 700.0)], [turn] * 4)
+    pose = (*turned(150.0, 2000.0), turn)
+    room = Room(wall, rest(*pose))
+    follower = tracker(wall)
+    lit = dict.fromkeys(range(4), 60)
+    steps = [follower.step(room.frame(lit)) for _ in range(30)]
+    assert steps[-1].estimate is not None
+    assert np.abs(room.errors(steps)).max(axis=0)[:2].max() < 5
+
+
+def test_several_leds_of_different_walls_are_not_guessed() -> None:
+    corner = LedMap(
+        range(4),
+        [(-400.0, 0.0), (400.0, 0.0), (1000.0, 600.0), (1000.0, 1000.0)],
+        [0.0, 0.0, math.pi / 2, math.pi / 2],
+    )
+    room = Room(corner, rest(0.0, 3000.0, 0.2))
+    follower = tracker(corner)
+    for _ in range(30):
+        step = follower.step(room.frame(dict.fromkeys(range(4), 60)))
+        assert not step.innovations
+    assert step.estimate is None
+    for number in range(30):
+        step = follower.step(room.frame({number % 4: 60}))
+    assert step.estimate is not None
+
+
 def test_frames_without_a_time_follow_each_other() -> None:
     room = Room(TWO, rest(0.0, 1500.0))
     follower = tracker(TWO)
