@@ -193,7 +193,13 @@ def check_committed(board: Board, folder: Path | None = None) -> list[Finding]:
     """
     folder = kicad.COMMITTED / board.name if folder is None else folder
     files = {path.name: path for path in (*folder.glob("*"), *folder.glob("gerbers/*"))}
-    wanted = {f"{board.name}.kicad_pcb", f"{board.name}.pdf", "gerbers", *kicad.sources(board)}
+    wanted = {
+        f"{board.name}.kicad_pcb",
+        f"{board.name}.pdf",
+        "gerbers",
+        kicad.SUMS,
+        *kicad.sources(board),
+    }
     wanted |= {f"{board.name}-{side}.svg" for side in ("front", "back")}
     wanted |= {
         f"{board.name}-{layer.replace('.', '_')}.{end}" for layer, end in kicad.LAYERS.items()
@@ -208,6 +214,9 @@ def check_committed(board: Board, folder: Path | None = None) -> list[Finding]:
         for name, path in files.items()
         if path.suffix not in {"", ".pdf"} or name == "sym-lib-table"
     }
+    written = (folder / kicad.SUMS).read_text(encoding="utf-8").splitlines()
+    for line in sorted(set(kicad.sums(folder).splitlines()) - set(written)):
+        found.append(Finding("sum", line.partition("  ")[2], "is not as KiCad wrote it"))
     for name, text in kicad.sources(board).items():
         if texts[name] != text:
             found.append(Finding("source", name, "is not what the board's data give"))

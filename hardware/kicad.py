@@ -8,6 +8,7 @@ of the system's Python.
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import os
 import re
@@ -43,6 +44,9 @@ LAYERS: Final = {
     "Edge.Cuts": "gm1",
 }
 """Layers of which there is a Gerber file, and its suffix."""
+
+SUMS: Final = "SHA256SUMS"
+"""File of a project in which the others' sums are, as ``sha256sum`` writes and reads them."""
 
 PYTHON: Final = "/usr/bin/python3"
 """The interpreter that has ``pcbnew``."""
@@ -228,6 +232,18 @@ def sources(board: Board, placed: Mapping[str, Any] | None = None) -> dict[str, 
     }
 
 
+def sums(folder: Path) -> str:
+    """Return what `SUMS` of a project says as long as its files are as KiCad wrote them."""
+    names = sorted(
+        path.relative_to(folder).as_posix()
+        for path in folder.rglob("*")
+        if path.is_file() and path.name != SUMS
+    )
+    return "".join(
+        f"{hashlib.sha256((folder / name).read_bytes()).hexdigest()}  {name}\n" for name in names
+    )
+
+
 def _run(command: Sequence[str | Path], config: Path, text: str = "") -> str:
     environment = {**os.environ, "KICAD_CONFIG_HOME": str(config)}
     done = subprocess.run(  # noqa: S603
@@ -368,6 +384,7 @@ class Kicad:
             (folder / name).write_text(text, encoding="utf-8")
         self.lay_out(job(board, placed, folder / f"{board.name}.kicad_pcb"))
         self.plot(folder)
+        (folder / SUMS).write_text(sums(folder), encoding="utf-8")
 
 
 def main() -> None:

@@ -99,6 +99,9 @@ FAULTS: dict[str, tuple[str, Callable[[str], str], str]] = {
     "a hole drilled elsewhere": ("-NPTH.drl", swap("X-19.0Y19.0", "X-18.0Y19.0"), "drill"),
     "a pad's copper moved": ("-F_Cu.gtl", swap("X-12700000Y-5080000D03", "X0Y0D03"), "plot"),
     "a pad's copper gone": ("-B_Cu.gbl", swap("X-12700000Y-5080000D03*", ""), "plot"),
+    "copper between two nets": ("-F_Cu.gtl", swap("M02*", "X0Y0D02*\nX9000000Y0D01*\nM02*"), "sum"),
+    "a pad under solder mask": ("-B_Mask.gbs", swap("D03*", "D02*"), "sum"),
+    "a name on the wrong part": ("-F_Silkscreen.gto", swap("D01*", "D02*"), "sum"),
     "another outline": ("-Edge_Cuts.gm1", swap("X22500000Y22500000", "X32500000Y22500000"), "plot"),
 }
 
