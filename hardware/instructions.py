@@ -66,7 +66,7 @@ def page(plan: Plan, files: Sequence[str]) -> str:
         "What to buy": _bills(plan),
         "Boards": _boards(plan),
         "Put it together": _assembly(plan),
-        "Wiring": _wiring(),
+        "Wiring": _wiring(plan),
         "Firmware and first light": _first_light(plan),
         "Hazards of the circuits": _hazards(plan),
         "What was checked, and what was not": _checked(plan),
@@ -364,7 +364,7 @@ def _soldering(board: Board) -> Iterator[str]:
             )
 
 
-def _wiring() -> str:
+def _wiring(plan: Plan) -> str:
     text = """
 <p>Jumper wires, all boards without power. Every connector needs its own ground wire.</p>"""
     for connector in WIRING.connectors:
@@ -376,8 +376,18 @@ def _wiring() -> str:
         ]
         title = f"{connector.name} (thesis, table {connector.table})"
         text += _table(("Net", WIRING.mcu.part, connector.other), rows, "lll", caption=title)
+    board = plan.boards[-1]
+    (control,) = (c for c in WIRING.connectors if c.other == board.connectors["P1"].wiring)
+    nets = {f"LED {end}": net for net, end in control.wires}
+    sockets = [
+        (reference, plug.to, nets.get(plug.to, ""), *(name for name, _ in plug.pins))
+        for reference, plug in board.connectors.items()
+        if plug.to in nets or not (plug in board.leds or plug.wiring)
+    ]
+    columns = ("Socket", "For", "Lit by", "Pin 1 (square)", "Pin 2")
     return (
         text
+        + _table(columns, sockets, "lllll", caption=f"{board.title} to LEDs and their supply")
         + """
 <p>The same tables, and those of extensions, are in <code>wiring/wiring.md</code>; <code>wiring/wiring.h</code> is the header
 that the firmware is compiled with. All come from one file, so that they agree.</p>"""

@@ -190,6 +190,7 @@ class Plan:
             f"Nucleo board with {wiring.WIRING.mcu.part}": 1,
             f"supply of the LEDs, {self.led_supply:g} V": 1,
             f"socket strip, {pins} pins, for the sensor": 2,
+            "jumper wire": sum(len(plug.wires) for plug in wiring.WIRING.connectors if plug.table),
             **screws,
             f"{self.clamp_screw}, clamps the LED mount": LEDS,
             "M3 nut": LEDS,

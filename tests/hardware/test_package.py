@@ -212,6 +212,12 @@ def test_page_stands_alone(built: Package) -> None:
             assert change.why in page.text
     for part in built.plan.printed:
         assert part.path in page.text
+    for socket in (
+        ("J1", "LED 1", "led1", "anode", "cathode"),
+        ("J2", "LED 2", "led0", "anode", "cathode"),
+        ("J7", "supply of the LEDs", "", "+LED", "GND"),
+    ):
+        assert "".join(f"<td>{words}</td>" for words in socket) in text.replace("\n", "")
 
 
 def test_pictures_are_png() -> None:
