@@ -176,6 +176,7 @@ def _printing(plan: Plan) -> str:
         )
     rules, grams = plan.mount.rules, _PLA * sum(volume(p.solid) * p.amount for p in plan.printed)
     settings = [
+        ("Printer", f"{' × '.join(f'{side:g}' for side in mechanics()['printer']['size'])} mm at least: no part is larger"),
         ("Layers", f"{LAYER:g} mm (as the thesis printed)"),
         ("Nozzle, walls", (f"0.4 mm, at least three lines: no wall is thinner than "
          f"{rules.printable_wall:g} mm")),

@@ -32,6 +32,8 @@ from hardware.boards import BOARDS
 from hardware.checks import check_led_mount, check_mount, check_stand
 from hardware.committed import check_committed
 from hardware.electrical import check_board
+from hardware.findings import Finding
+from hardware.mesh import bounds, mesh, stl, volume
 from hardware.mount import lens_mount, mechanics
 from hardware.solids import Placed
 from hardware.stand import led_mount, stand
@@ -39,11 +41,10 @@ from raytransfer.designs import Design, design_text
 from raytransfer.sensors import TCD1304, LineSensor
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from hardware.boards import Board
     from hardware.circuits import Measurement
-    from hardware.findings import Finding
     from hardware.mount import LensMount
     from hardware.solids import Axis, Solid
     from hardware.stand import LedMount, Stand
@@ -222,8 +223,6 @@ class Plan:
 
     def figures(self) -> dict[str, Any]:
         """Return the sizes and sums that a manifest has; lengths in mm, prices in euro."""
-        from hardware.mesh import volume
-
         return {
             "mount_size_mm": [round(side, 4) for side in self.mount.size],
             "lens_heights_above_cover_mm": {
@@ -362,6 +361,8 @@ def make_plan(
     found = [Fault("lens mount", finding) for finding in check_mount(mount)]
     found += [Fault("stand", finding) for finding in check_stand(around)]
     found += [Fault("LED mount", finding) for finding in check_led_mount(led)]
+    plan = Plan(design, variant, mount, around, led, boards, None, ())
+    found += _check_sizes(plan.printed)
     for board in boards:
         found += [
             Fault(board.title, finding)
@@ -379,7 +380,19 @@ def make_plan(
     faults = [fault for fault in found if not _known(fault, boards)]
     if faults:
         raise FaultsError(faults)
-    return Plan(design, variant, mount, around, led, boards, measurements, tuple(found))
+    return replace(plan, measurements=measurements, hazards=tuple(found))
+
+
+def _check_sizes(parts: Iterable[PrintedPart]) -> Iterator[Fault]:
+    bed = mechanics()["printer"]["size"]
+    for part in parts:
+        low, high = bounds(part.solid)
+        size = high - low
+        if (size > bed).any():
+            words = " × ".join(f"{side:.0f}" for side in size)
+            room = " × ".join(f"{side:g}" for side in bed)
+            finding = Finding("printer", "size", f"{words} mm; {room} mm can be printed")
+            yield Fault(part.name, finding)
 
 
 def _known(fault: Fault, boards: Sequence[Board]) -> bool:
@@ -467,8 +480,6 @@ def _write(plan: Plan, folder: Path) -> dict[str, Any]:
 
 
 def _contents(plan: Plan) -> Iterator[tuple[str, bytes]]:
-    from hardware.mesh import mesh, stl
-
     for part in plan.printed:
         yield part.path, stl(mesh(part.solid))
     for board in plan.boards:
@@ -522,8 +533,6 @@ It has run in a simulator of the microcontroller, not yet on a board.
 
 
 def _on_bed(solid: Solid) -> Placed:
-    from hardware.mesh import bounds
-
     return Placed(solid, (0.0, 0.0, -float(bounds(solid)[0, 2])))
 
 
@@ -535,8 +544,6 @@ def _lying(solid: Solid) -> Placed:
 
 def overhang(solid: Solid) -> float:
     """Area that faces down by more than 45° and is not on the bed, mm²; z is up."""
-    from hardware.mesh import mesh
-
     surface = mesh(solid)
     low = surface.bounds[0, 2]
     on_bed = surface.triangles[:, :, 2].max(axis=1) < low + 1e-3

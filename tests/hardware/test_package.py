@@ -302,6 +302,14 @@ def test_colliding_lenses(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> No
     assert ("lens mount", "collision") in stopped(tmp_path)
 
 
+@pytest.mark.usefixtures("quick")
+def test_a_part_larger_than_a_printer(tmp_path: Path) -> None:
+    long = replace(THESIS, gaps=(THESIS.gaps[0], 200.0, *THESIS.gaps[2:]))
+    assert {("lens mount lower", "printer"), ("lens mount upper", "printer")} <= {
+        *stopped(tmp_path, long)
+    }
+
+
 def with_boards(monkeypatch: pytest.MonkeyPatch, name: str, **changes: object) -> None:
     board = replace(BOARDS[name], **changes)  # type: ignore[arg-type]
     monkeypatch.setattr(package, "BOARDS", MappingProxyType({**BOARDS, name: board}))
