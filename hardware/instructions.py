@@ -20,11 +20,10 @@ from hardware import kicad
 from hardware.boards import BOARDS, DATA, SURROUNDINGS
 from hardware.circuits import assumptions, show
 from hardware.electrical import check_board
-from hardware.mesh import bounds, manifold, volume
+from hardware.mesh import bounds, cross_section, volume
 from hardware.mount import mechanics
 from hardware.package import LEDS, Fault, overhang
 from hardware.render import exploded, on_pole, picture, standing
-from hardware.solids import Placed
 from raytransfer.lenses import Lens, SphericalLens
 
 if TYPE_CHECKING:
@@ -588,9 +587,9 @@ def section(mount: LensMount) -> str:
 
 def _cut(solid: Solid, fill: str, edge: str) -> str:
     """Return a cut just below y = 0, seen from above: light to the right, +X up."""
-    rings = manifold(Placed(solid, axis="x", quarters=1)).slice(-0.02).to_polygons()
     path = "".join(
-        "M" + "L".join(f"{-z:.2f} {-x:.2f}" for x, z in np.asarray(ring)) + "Z" for ring in rings
+        "M" + "L".join(f"{z:.2f} {-x:.2f}" for z, x in ring) + "Z"
+        for ring in cross_section(solid, "y", -0.02)
     )
     return f'<path d="{path}" fill="{fill}" stroke="{edge}" stroke-width=".2" fill-rule="evenodd"/>'
 

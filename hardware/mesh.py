@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import struct
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -163,6 +163,28 @@ def write_stl(solid: Solid, path: str | os.PathLike[str]) -> Path:
 def volume(solid: Solid) -> float:
     """Volume of the triangles, mm³."""
     return float(manifold(solid).volume())
+
+
+def cross_section(solid: Solid, axis: Literal["x", "y"], at: float) -> list[NDArray[np.float64]]:
+    """Return the outlines of what a plane cuts out of a solid.
+
+    Parameters
+    ----------
+    solid : Solid
+    axis : {"x", "y"}
+        Across the plane.
+    at : float
+        Where on it, mm.
+
+    Returns
+    -------
+    list of ndarray, shape (N, 2)
+        z, and the third coordinate, mm.
+    """
+    if axis == "x":
+        return list(manifold(Placed(solid, axis="y", quarters=1)).slice(-at).to_polygons())
+    rings = manifold(Placed(solid, axis="x", quarters=1)).slice(at).to_polygons()
+    return [ring[:, ::-1] * (-1, 1) for ring in rings]
 
 
 def bounds(solid: Solid) -> NDArray[np.float64]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pytest
@@ -13,6 +13,7 @@ import trimesh
 from hardware.mesh import (
     SEGMENTS,
     bounds,
+    cross_section,
     manifold,
     manifold_of,
     mesh,
@@ -162,3 +163,18 @@ def test_an_open_mesh_is_no_solid() -> None:
     surface.update_faces(np.arange(len(surface.faces)) > 0)
     with pytest.raises(ValueError, match="no closed surface"):
         manifold_of(surface)
+
+
+@pytest.mark.parametrize(
+    ("axis", "at", "low", "high"),
+    [("x", 6.0, (0.0, 0.0), (2.0, 1.0)), ("y", -1.0, (-3.0, -1.0), (6.0, 4.0))],
+)
+def test_cross_sections_lie_as_the_solid_does(
+    axis: Literal["x", "y"], at: float, low: Any, high: Any
+) -> None:
+    step = Box((4.0, 0.0, 0.0), (8.0, 1.0, 2.0))
+    solid = Union((Box((-1.0, -2.0, -3.0), (4.0, 5.0, 6.0)), step))
+    (ring,) = cross_section(solid, axis, at)
+    assert ring.min(axis=0) == pytest.approx(low, abs=1e-6)
+    assert ring.max(axis=0) == pytest.approx(high, abs=1e-6)
+    assert cross_section(solid, axis, 20.0) == []
