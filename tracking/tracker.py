@@ -92,7 +92,7 @@ _ODD = SpikeFlags.MISSING.value | _UNCERTAIN
 _KEPT = PoseFlags.INCONSISTENT | PoseFlags.UNCHECKED
 _USUAL = 1.6  # times the mean width: wider is unusual
 _LEAST = 0.15  # of a lamp's height by which its light may have changed
-_PARALLEL = 0.1  # rad between the facings of a wall's LEDs
+_PARALLEL = 0.995  # cosine between the facings of a wall's LEDs
 _APART = 1.0  # widths: spikes of one frame that are nearer cannot be told apart
 
 
@@ -454,7 +454,8 @@ class Tracker:
             return {channels[0]: found[0] if found else MISSING}
         rows = [self.leds.index(n) for n in channels]
         facings = self.leds.facings[rows]
-        if len(found) < len(channels) or np.ptp(facings) > _PARALLEL:
+        parallel = np.cos(facings - facings[0]).min() > _PARALLEL
+        if len(found) < len(channels) or not parallel:
             return {}
         turned = self.calibration.camera.scale < 0
         wall = np.array([math.cos(facings[0]), math.sin(facings[0])])

@@ -473,7 +473,8 @@ def test_several_leds_are_told_apart_on_any_wall(turn: float) -> None:
     def turned(x: float, y: float) -> tuple[float, float]:
         return x * cos - y * sin, x * sin + y * cos
 
-    wall = LedMap(range(4), [turned(x, 0.0) for x in (-600.0, -100.0, 300.0, 700.0)], [turn] * 4)
+    facings = [math.remainder(turn + error, math.tau) for error in (0.0, 0.001, 0.0, 0.0)]
+    wall = LedMap(range(4), [turned(x, 0.0) for x in (-600.0, -100.0, 300.0, 700.0)], facings)
     pose = (*turned(150.0, 2000.0), turn)
     room = Room(wall, rest(*pose))
     follower = tracker(wall)
