@@ -55,8 +55,8 @@ class Measurement:
     check : str
         The hazard if it is out of its limit; as `hardware.electrical.check_board` calls it.
     what : str
-    value, limit : float
-        In `unit`; the limit is nan where there is none.
+    value, limit, least : float
+        In `unit`; most and least that it may be, nan where there is no limit.
     unit : str
         Without prefix.
     where : str
@@ -71,11 +71,12 @@ class Measurement:
     limit: float
     where: str
     change: str = ""
+    least: float = math.nan
 
     @property
     def holds(self) -> bool:
-        """Whether it keeps within its limit."""
-        return math.isnan(self.limit) or self.value <= self.limit
+        """Whether it keeps within its limits."""
+        return not (self.value > self.limit or self.value < self.least)
 
 
 # --- decks ---------------------------------------------------------------------------------------
@@ -324,6 +325,8 @@ def _converter(netlist: Netlist) -> Iterator[Measurement]:
         "",
         math.nan,
         "OS",
+        "divide OS by less",
+        least=SURROUNDINGS["limits"]["gain"],
     )
 
 
@@ -408,6 +411,7 @@ def _led(netlist: Netlist) -> Iterator[Measurement]:
         SURROUNDINGS["led"]["ampere"],
         place,
         change,
+        least=limits["current"] * SURROUNDINGS["led"]["ampere"],
     )
     yield Measurement(
         "series resistor",
@@ -451,7 +455,7 @@ def _led(netlist: Netlist) -> Iterator[Measurement]:
             f"power of {part.reference} while the LED is on",
             full**2 * part.type.amount,
             "W",
-            float(part.type.limits["power_w"]),
+            float(part.type.limits.get("power_w", limits["resistor_watt"])),
             part.reference,
             "take a larger one",
         )
@@ -506,7 +510,8 @@ def check_circuits(board: Board) -> list[Finding]:
         Finding(
             m.check,
             m.where,
-            f"{m.what}: {show(m)} ({assembly}), limit {show(m, m.limit)}",
+            f"{m.what}: {show(m)} ({assembly}), limit "
+            + show(m, m.least if m.value < m.least else m.limit),
             m.change,
         )
         for assembly in board.assemblies

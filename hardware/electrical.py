@@ -459,6 +459,31 @@ def _led_current(netlist: Netlist, _: Wiring) -> Iterator[Finding]:
                 )
 
 
+def _alike(netlist: Netlist, _: Wiring) -> Iterator[Finding]:
+    """All LEDs are switched alike: the simulation is of the first."""
+
+    def parts(led: Connector) -> list[str]:
+        drain = netlist.plugged(led, "cathode")
+        nets = {drain, netlist.plugged(led, "anode")}
+        nets |= {
+            netlist.at(part, "G")
+            for part in netlist.of_kind("nmos")
+            if netlist.at(part, "D") == drain
+        }
+        nets -= set(netlist.volts)
+        return sorted(
+            str(part.type)
+            for part in netlist.parts.values()
+            if any(net in nets for _, _, net in netlist.pins(part))
+        )
+
+    leds = netlist.board.leds
+    for led in leds[1:]:
+        if (other := parts(led)) != (first := parts(leds[0])):
+            message = f"has {', '.join(other)}; {leds[0].to} has {', '.join(first)}"
+            yield Finding("LEDs alike", led.to, message)
+
+
 def _bulk(netlist: Netlist, _: Wiring) -> Iterator[Finding]:
     if not any(netlist.of_kind("nmos")):
         return
@@ -494,6 +519,7 @@ CHECKS: Final[Sequence[Callable[[Netlist, Wiring], Iterator[Finding]]]] = (
     _converter,
     _master_clock,
     _led_current,
+    _alike,
     _bulk,
 )
 """Every check of a netlist."""

@@ -112,7 +112,7 @@ def _overview(plan: Plan) -> str:
     size = " × ".join(f"{side:.1f}" for side in mount.size)
     rows = [
         ("Lens mount, outside (width × height × length)", f"{size} mm"),
-        ("Halves held together by", f"{len(mount.screws)} × {plan.stand.rules['mount_screw']}"),
+        ("Halves held together by", f"{len(mount.screws)} × {plan.mount_screw}"),
         ("LEDs", f"{LEDS}, on a pole of {plan.led.rules['pole']:g} mm"),
         ("Supply of the LEDs", f"{plan.led_supply:g} V"),
         ("Parts whose price is known", f"{_total(plan.bills.values())} €"),
@@ -294,7 +294,7 @@ def _assembly(plan: Plan) -> str:
                 "lens is turned round or has moved."
             ),
             (
-                f"Set the head on the lens holder, {around.rules['mount_screw']} screws with washers "
+                f"Set the head on the lens holder, {plan.mount_screw}s with washers "
                 "from above through both halves and the holder, nuts below. Tighten crosswise until "
                 "the halves touch, no more."
             ),
@@ -304,7 +304,7 @@ def _assembly(plan: Plan) -> str:
             ),
             (
                 f"Screw the sensor's board to the back of the head with {len(mount.board.holes)} "
-                f"{mechanics()['sensor_board']['screw']} screws, sensor inwards, crosswise and only hand-tight."
+                f"{mechanics()['sensor_board']['screw']} screws, sensor inwards, {_connector_side(plan.boards[0])}, crosswise and only hand-tight."
             ),
         ],
         "Stand": [
@@ -348,13 +348,23 @@ def _computer(name: str) -> str:
     }[name]
 
 
+def _connector_side(board: Board) -> str:
+    """Say how the sensor's board is turned: its screw holes would take it any way round."""
+    x, y = kicad.layout_of(board)["board"]["parts"]["P1"][:2]  # seen from the light, y up
+    sides = ("right", "left") if abs(x) > abs(y) else ("bottom", "top")
+    return f"connector P1 at the {sides[max(x, y, key=abs) > 0]} seen from behind"
+
+
 def _soldering(board: Board) -> Iterator[str]:
     built = board.assemblies[0]
     spare = [part.reference for part in board.parts.values() if part.only not in {"", built}]
     left = f" Leave out {', '.join(spare)}." if spare else ""
+    front = kicad.layout_of(board)["board"]["front"]
+    sides = "" if front == "all" else f" All but {', '.join(front)} go on the back."
     yield (
         f"Solder the {board.title}, low parts first: resistors, diodes, sockets and small "
-        f"capacitors, then the rest.{left}"
+        "capacitors, then the rest, each on the side where its outline is "
+        f"printed.{sides}{left}"
     )
     for assembly, *ends in board.wires:
         if assembly == built:
@@ -490,17 +500,24 @@ def _checked(plan: Plan) -> str:
             "against the printed triangles), slits stop what they should, screw holes, room for the "
             "sensor's board, wall thickness."
         ),
-        "Stand and LED mount: closed surfaces, collisions, holes, wall thickness.",
+        (
+            "Stand and LED mount: closed surfaces, collisions, holes, wall thickness. No part is larger "
+            "than the printer."
+        ),
         (
             "Boards: open nets, shorts, unconnected pins, supplies, every pin's role, agreement with "
-            "the wiring tables and the sensor's pins."
+            "the wiring tables and the sensor's pins, six LEDs' switches alike."
         ),
-        "Board files: schematic, layout, drill and copper files are those of the boards' data.",
+        (
+            "Board files: schematic and layout are those of the boards' data, pads and holes those of the "
+            "layout, and every file is as KiCad wrote it, whose own checks had passed."
+        ),
     ]
     if plan.measurements is not None:
         done.append("Circuits: simulated with ngspice, in every way to fit the parts.")
     left = [
         "Nothing has been fabricated: no print, no board, no measurement.",
+        "Whether light gets in through walls, screw holes or the seam was not followed.",
         *(f"Left out here: {what}." for what in plan.left_out()),
     ]
     lists = ("".join(f"<li>{escape(item)}</li>" for item in items) for items in (done, left))

@@ -118,7 +118,6 @@ class Rules:
     play: float
     front_screw: float
     screw_hole: float
-    screw: str
     core_hole: float
     core_depth: float
     field: Field

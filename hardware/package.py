@@ -67,7 +67,6 @@ LEDS: Final = len(
 
 _BOARDS: Final = ("tcd1304", "led-driver")
 _EPOCH: Final = (1980, 1, 1, 0, 0, 0)  # of files in archives: the first that zip knows
-_SCREWS: Final = (6, 8, 10, 12, 16, 20, 25)  # lengths that M2.5 and M3 are sold in, mm
 _TURNS: Final[tuple[tuple[Axis, int], ...]] = (
     ("x", 0), ("x", 1), ("x", 2), ("x", 3), ("y", 1), ("y", 3),
 )  # fmt: skip
@@ -169,8 +168,8 @@ class Plan:
     def bills(self) -> dict[str, Bill]:
         """Bills of materials, by the names of their files."""
         head = head_bill(self.design.system)
-        own = f"{self.mount.rules.screw} screw"  # the stand's longer ones take their place
-        head = replace(head, lines=tuple(line for line in head.lines if line.type != own))
+        # on the stand, those with a length
+        head = replace(head, lines=tuple(line for line in head.lines if line.type != "M3 screw"))
         return {
             "lens-head": head,
             **{board.name: board_bill(board) for board in self.boards},
@@ -183,7 +182,7 @@ class Plan:
 
     def _joining(self) -> dict[str, int]:
         pins = mechanics()["package"][self.design.sensor.name]["pins_in_a_row"]
-        screws = Counter({f"{self.stand.rules['mount_screw']} screw": len(self.mount.screws)})
+        screws = Counter({self.mount_screw: len(self.mount.screws)})
         screws[self.board_screw] += sum(len(board.holes) for board in self.stand.boards)
         screws[self.foot_screw] += len(self.stand.foot_screws)
         return {
@@ -213,8 +212,13 @@ class Plan:
     def clamp_screw(self) -> str:
         """Screw that closes the LED's mount around its pole, with a nut."""
         rules = self.led.rules
-        through = 2 * rules["ear"][0] + rules["slit"] + 3.0  # and a nut with a turn to spare
-        return f"M3 x {min(length for length in _SCREWS if length >= through)} screw"
+        return _bolt(2 * rules["ear"][0] + rules["slit"])
+
+    @property
+    def mount_screw(self) -> str:
+        """Screw through both halves and the stand, with two washers and a nut."""
+        washers = 2 * mechanics()["screws"]["washer"]
+        return _bolt(self.mount.size[1] + self.stand.rules["plate"] + washers)
 
     @property
     def led_supply(self) -> float:
@@ -312,7 +316,11 @@ def build_package(
     target = Path(folder).resolve()
     _check_target(target)
     plan = make_plan(system, sensor=sensor, variant=variant, notes=notes)
-    staging = Path(tempfile.mkdtemp(dir=target.parent, prefix=f".{target.name}-", suffix=".part"))
+    prefix = f".{target.name}-"
+    try:
+        staging = Path(tempfile.mkdtemp(dir=target.parent, prefix=prefix, suffix=".part"))
+    except OSError as error:  # it names the temporary folder
+        raise OSError(error.errno, error.strerror, str(target)) from error
     new, old = staging / "new", staging / "old"
     try:
         new.mkdir()
@@ -553,7 +561,18 @@ def overhang(solid: Solid) -> float:
 
 def _screw(thread: str, through: float, core: float) -> str:
     """Name the longest screw that goes through a thing into a core hole without meeting its end."""
-    return f"{thread} x {max(length for length in _SCREWS if length < through + core)} screw"
+    lengths = mechanics()["screws"]["lengths"]
+    return f"{thread} x {max(length for length in lengths if length < through + core)} screw"
+
+
+def _bolt(through: float) -> str:
+    """Name the shortest M3 screw that goes through a thing and its nut."""
+    screws = mechanics()["screws"]
+    needed = through + screws["nut"]
+    length = next((length for length in screws["lengths"] if length >= needed), None)
+    if length is None:
+        raise ValueError(f"no M3 screw of {needed:.0f} mm is sold: the lenses are too high")
+    return f"M3 x {length} screw"
 
 
 def _has_cad() -> bool:

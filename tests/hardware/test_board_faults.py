@@ -227,6 +227,13 @@ def test_fault_is_found(fault: str) -> None:
     assert (check, where) in {finding[:2] for finding in found}, [str(f) for f in found]
 
 
+def test_an_led_that_is_not_driven_as_the_others() -> None:
+    """The simulation takes the first for all."""
+    edits = {'R3 = { part = "resistor-3r3"': 'R3 = { part = "resistor-150"'}
+    found = check_board(changed("led-driver-improved", edits))
+    assert [(f.check, f.where, f.hazard) for f in found] == [("LEDs alike", "LED 3", False)]
+
+
 def test_flyback_diode_reversed() -> None:
     edits = {'"D2.1"': '"D2.2"', 'cathode2 = ["D2.2"]': 'cathode2 = ["D2.1"]'}
     found = check_board(changed("led-driver-improved", edits))

@@ -8,6 +8,7 @@ import shutil
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -192,6 +193,24 @@ def test_values_of_the_board_are_those_of_the_deck() -> None:
     found = {m.what: m for m in measure(changed) if m.check == "settling"}
     assert not any(m.holds for m in found.values())
     assert all(measured("tcd1304")[what].holds for what in found)
+
+
+@needs_ngspice
+@pytest.mark.parametrize(
+    ("name", "part", "values", "check", "limit"),
+    [
+        ("tcd1304-improved", "R6", {"value": 6800.0}, "gain", "60 %"),
+        ("led-driver-improved", "R1", {"value": 10.0, "limits": {}}, "series resistor", "900 mA"),
+        ("led-driver-improved", "R1", {"limits": {}}, "power", "250 mW"),
+    ],
+)
+def test_values_that_are_too_small_or_too_weak(
+    name: str, part: str, values: dict[str, Any], check: str, limit: str
+) -> None:
+    board = BOARDS[name]
+    other = replace(board.parts[part], type=replace(board.parts[part].type, **values))
+    found = check_circuits(replace(board, parts={**board.parts, part: other}))
+    assert [f for f in found if f.check == check and f.message.endswith(f"limit {limit}")], found
 
 
 @needs_ngspice

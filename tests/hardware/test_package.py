@@ -26,10 +26,11 @@ import trimesh
 from acquisition import wiring
 from hardware import circuits, instructions, kicad, package
 from hardware.boards import BOARDS, SURROUNDINGS, Terminal
-from hardware.mount import LensMount, lens_mount
+from hardware.mount import LensMount, lens_mount, mechanics
 from hardware.package import FaultsError, Package, build_package, make_plan
 from hardware.solids import Placed
 from raytransfer.designs import DESIGNS, load_design
+from raytransfer.lenses import Lens
 from raytransfer.systems import OpticalSystem
 
 if TYPE_CHECKING:
@@ -145,7 +146,27 @@ def test_screws_fit(built: Package) -> None:
         assert through + 4 <= length < through + depth
     assert lines[plan.board_screw] == 7 + 4  # section 4.4.1: seven for the computers; LED board
     assert lines["M3 x 55 screw"] == 4
-    assert "M3 x 50 screw" not in {line.type for line in plan.bills["lens-head"].lines}
+    assert "M3 screw" not in {line.type for line in plan.bills["lens-head"].lines}
+
+
+@pytest.mark.usefixtures("quick")
+def test_screws_are_as_long_as_the_mount_is_high(monkeypatch: pytest.MonkeyPatch) -> None:
+    lenses = [
+        replace(lens, length=50.0) if isinstance(lens, Lens) and lens.height > 20 else lens
+        for lens in THESIS.elements
+    ]
+    high = make_plan(replace(THESIS, elements=tuple(lenses)))
+    assert high.mount.size[1] > 50
+    needed = high.mount.size[1] + high.stand.rules["plate"] + 2 * 0.5 + 2.4
+    length = float(high.mount_screw.split()[2])
+    assert needed <= length < needed + 10
+    assert high.bills["stand"].lines
+    known = mechanics()
+    monkeypatch.setattr(
+        package, "mechanics", lambda: {**known, "screws": {**known["screws"], "lengths": [10, 55]}}
+    )
+    with pytest.raises(ValueError, match="no M3 screw of 62 mm is sold"):
+        _ = high.mount_screw
 
 
 def test_wiring_and_design_are_the_project_s(built: Package) -> None:
@@ -204,6 +225,8 @@ def test_page_stands_alone(built: Package) -> None:
         "PB13",
         "25.40",
         "PCX_30_32_60 (1)",
+        "connector P1 at the right seen from behind",
+        "All but U1 go on the back.",
     ):
         assert words in page.text
     for board in built.plan.boards:
