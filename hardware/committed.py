@@ -215,8 +215,9 @@ def check_committed(board: Board, folder: Path | None = None) -> list[Finding]:
         if path.suffix not in {"", ".pdf"} or name == "sym-lib-table"
     }
     written = (folder / kicad.SUMS).read_text(encoding="utf-8").splitlines()
-    for line in sorted(set(kicad.sums(folder).splitlines()) - set(written)):
-        found.append(Finding("sum", line.partition("  ")[2], "is not as KiCad wrote it"))
+    differing = set(written) ^ set(kicad.sums(folder).splitlines())
+    for name in sorted({line.partition("  ")[2] for line in differing}):
+        found.append(Finding("sum", name, "is not as KiCad wrote it"))
     for name, text in kicad.sources(board).items():
         if texts[name] != text:
             found.append(Finding("source", name, "is not what the board's data give"))

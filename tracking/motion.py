@@ -310,6 +310,7 @@ class MotionFilter:
         self._unchecked = False  # the pose: too few LEDs speak for it …
         self._witnesses: frozenset[int] = frozenset()  # … and these
         self._speakers = 0  # how many of them would have told if it were wrong
+        self._agreed: set[int] = set()  # LEDs that have passed narrow gates since
         self._refused: set[int] = set()  # since any spike was believed
         self.lost = True
         self.losses = 0
@@ -399,6 +400,7 @@ class MotionFilter:
         self.lost = False
         self._unchecked = unchecked
         self._refused.clear()
+        self._agreed.clear()
         self._used_ns = self._t
         self._recent = self._doubts = 0
         self._mean_nis = 1.0
@@ -479,6 +481,7 @@ class MotionFilter:
             self._refused.add(row)
             if self._doubts and not self._unchecked:  # what agreed may have been the reflection
                 self._unchecked, self._witnesses = True, frozenset()
+                self._agreed.clear()
             self._flags |= _REJECTED
         if outcome is not Outcome.UNSEEN:
             nis = min(residual * residual / scale, self._gate)
@@ -682,9 +685,14 @@ class MotionFilter:
         if doubt > DOUBT**2 or row in self._refused:
             if not self._unchecked:
                 self._unchecked, self._witnesses = True, frozenset([row])
+                self._agreed.clear()
             return
-        if self._unchecked and (row in self._witnesses or doubt > (DOUBT / 2) ** 2 or self._recent):
-            return
+        if self._unchecked:
+            if doubt > (DOUBT / 2) ** 2 or self._recent:
+                return
+            self._agreed.add(row)
+            if row in self._witnesses and len(self._agreed) <= NEEDED:
+                return
         self._refused.clear()
         self._unchecked = False
 

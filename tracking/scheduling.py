@@ -245,9 +245,10 @@ class Schedule:
         self._turn = 0
         self._rows = {channel: row for row, channel in enumerate(leds.channels)}
         self._fluxes: NDArray[np.float64] = np.zeros(len(leds))
-        apart_mm = np.linalg.norm(leds.positions[:, None] - leds.positions, axis=2)
-        np.fill_diagonal(apart_mm, -1.0)
-        self._nearness = 1.0 / np.maximum(apart_mm.argsort(axis=1).argsort(axis=1), 1)
+        away = np.linalg.norm(leds.positions[:, None] - leds.positions, axis=2)
+        np.fill_diagonal(away, math.inf)
+        nearer = (away[:, None, :] < away[:, :, None] - 1e-6).sum(axis=2)  # than this one
+        self._nearness = 1.0 / (1.0 + nearer)
 
     def sequence(self, motion: MotionFilter, t_ns: int, frames: int) -> list[dict[int, int]]:
         """Plan frames.
@@ -343,8 +344,8 @@ class Schedule:
     def _search(self, motion: MotionFilter, start: int, frames: int) -> list[NDArray[np.int64]]:
         """One LED a frame while lock is lost: those that waited long, rather if they may be seen.
 
-        That is those found lately; where there was a pose, those that it says are in view; else
-        those not tried yet.
+        That is those found lately, and their neighbours; where there was a pose, those that it says
+        are in view; else those not tried yet.
         """
         seconds = start * 1e-9
         if not motion.losses:
@@ -387,8 +388,13 @@ class RoundRobin(Schedule):
         numbers = first + np.arange(frames * self.per_frame).reshape(frames, -1)
         return list(numbers % len(self.leds))
 
-    def _search(self, motion: MotionFilter, start: int, frames: int) -> list[NDArray[np.int64]]:
-        return self._plan(motion, start, frames, self._fluxes)
+    def _search(
+        self,
+        motion: MotionFilter,  # noqa: ARG002
+        start: int,  # noqa: ARG002
+        frames: int,
+    ) -> list[NDArray[np.int64]]:
+        return list((self._turn + np.arange(frames)[:, None]) % len(self.leds))
 
 
 class PredictedVisible(Schedule):

@@ -444,7 +444,8 @@ class Tracker:
         """Spikes of the whole line: the strongest, as many as LEDs are lit.
 
         Several at once are told apart by their order only: LEDs of a wall, seen from its front,
-        have that of their place along it. Of different walls, it depends on where one stands.
+        have that of their place along it. Of different walls, or where one is far before another, it
+        depends on where one stands.
         """
         channels = frame.channels
         if not channels:
@@ -454,12 +455,14 @@ class Tracker:
             return {channels[0]: found[0] if found else MISSING}
         rows = [self.leds.index(n) for n in channels]
         facings = self.leds.facings[rows]
+        wall = np.array([math.cos(facings[0]), math.sin(facings[0])])
+        places = self.leds.positions[rows, :2] @ np.column_stack([wall, [-wall[1], wall[0]]])
+        order = np.argsort(places[:, 0])
+        steps = np.diff(places[order], axis=0)
         parallel = np.cos(facings - facings[0]).min() > _PARALLEL
-        if len(found) < len(channels) or not parallel:
+        if len(found) < len(channels) or not parallel or (steps[:, 0] <= abs(steps[:, 1])).any():
             return {}
         turned = self.calibration.camera.scale < 0
-        wall = np.array([math.cos(facings[0]), math.sin(facings[0])])
-        order = np.argsort(self.leds.positions[rows, :2] @ wall, kind="stable")
         along = [channels[i] for i in order]
         spikes = sorted(found, key=lambda spike: spike.position, reverse=turned)
         return dict(zip(along, spikes, strict=True))

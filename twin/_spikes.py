@@ -119,6 +119,13 @@ def visible(seed, t, pose, leds, normals, rates, table, last, faults, seconds, l
 
 
 @_compile
+def within(spike, windows, k):
+    """Whether there is a spike, in a window if there are any."""
+    there = spike[5] > 0.0
+    return there and (len(windows) == 0 or windows[k, 0] <= spike[0] <= windows[k, 1])
+
+
+@_compile
 def expose(
     seed,
     draws,
@@ -210,17 +217,16 @@ def expose(
         out[k, 4] = MISSING
         best, second = -1, -1
         for i in range(found):
-            if there[i, 5] > 0.0 and (
-                there[i, 6] == 0.0
-                if len(windows) == 0
-                else windows[k, 0] <= there[i, 0] <= windows[k, 1]
-            ):
-                if best < 0 or there[i, 5] > there[best, 5]:
-                    best, second = i, best
-                elif second < 0 or there[i, 5] > there[second, 5]:
-                    second = i
+            free = len(windows) > 0 or there[i, 6] == 0.0
+            brighter = best < 0 or there[i, 5] > there[best, 5]
+            if free and brighter and within(there[i], windows, k):
+                best = i
         if best < 0:
             continue
+        for i in range(found):
+            brighter = second < 0 or there[i, 5] > there[second, 5]
+            if i != best and brighter and within(there[i], windows, k):
+                second = i
         there[best, 6] = 1.0
         out[k, :4] = there[best, :4]
         flags = int(there[best, 4])

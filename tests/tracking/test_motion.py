@@ -751,10 +751,32 @@ def test_an_led_that_was_easy_to_please_does_not_vouch_for_a_pose() -> None:
     assert innovation.sigma > 2 * DOUBT
     for _ in range(20):
         n += 1
-        motion.observe(n * FRAME, frame(pose, random, [seen[n % 3], fourth[0]]))
+        motion.observe(n * FRAME, frame(pose, random, [seen[n % 2], fourth[0]]))
     assert not motion.lost
     assert motion.unchecked
     motion.observe((n + 1) * FRAME, frame(pose, random, rows[[3]]))
+    assert not motion.unchecked
+
+
+def test_four_leds_that_go_on_to_agree_are_enough() -> None:
+    """There is no fifth, and one of them was easy to please when the pose was confirmed."""
+    random = np.random.default_rng(9)
+    pose = (50.0, 2500.0, 0.02)
+    rows = on_line(pixels(pose))[:4]
+    few = LedMap([LEDS.channels[row] for row in rows], LEDS.positions[rows])
+    motion, n = MotionFilter(CAMERA, few), 0
+    while not np.isfinite(motion.covariance).all():
+        n += 1
+        motion.observe(n * FRAME, frame(pose, random, rows[[n % 3]]))
+    n += 12
+    motion.observe(n * FRAME, frame(pose, random, rows[[3]]))
+    for _ in range(20):
+        n += 1
+        motion.observe(n * FRAME, frame(pose, random, rows[[n % 3]]))
+    assert motion.unchecked
+    for _ in range(12):
+        n += 1
+        motion.observe(n * FRAME, frame(pose, random, rows[[n % 4]]))
     assert not motion.unchecked
 
 

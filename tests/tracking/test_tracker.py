@@ -484,12 +484,20 @@ def test_several_leds_are_told_apart_on_any_wall(turn: float) -> None:
     assert np.abs(room.errors(steps)).max(axis=0)[:2].max() < 5
 
 
-def test_several_leds_of_different_walls_are_not_guessed() -> None:
-    corner = LedMap(
-        range(4),
-        [(-400.0, 0.0), (400.0, 0.0), (1000.0, 600.0), (1000.0, 1000.0)],
-        [0.0, 0.0, math.pi / 2, math.pi / 2],
-    )
+@pytest.mark.parametrize(
+    ("places", "facings"),
+    [
+        (
+            [(-400.0, 0.0), (400.0, 0.0), (1000.0, 600.0), (1000.0, 1000.0)],
+            [0.0, 0.0, math.pi / 2, math.pi / 2],
+        ),
+        ([(-400.0, 0.0), (0.0, 0.0), (100.0, 1000.0), (800.0, 0.0)], [0.0] * 4),
+        ([(-400.0, 0.0, 0.0), (0.0, 0.0, 0.0), (400.0, 0.0, 0.0), (400.0, 0.0, 50.0)], [0.0] * 4),
+    ],
+    ids=["corner", "one far before the others", "one above the other"],
+)
+def test_several_leds_whose_order_is_not_known_are_not_guessed(places: Any, facings: Any) -> None:
+    corner = LedMap(range(4), places, facings)
     room = Room(corner, rest(0.0, 3000.0, 0.2))
     follower = tracker(corner)
     for _ in range(30):
