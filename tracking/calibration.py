@@ -535,6 +535,8 @@ def load_calibration(path: str | os.PathLike[str]) -> Calibration:
         content = file.read()
     try:
         return _calibration(json.loads(content.decode("utf-8"), object_pairs_hook=_once))
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path}: no calibration, which is JSON ({error})") from error
     except (ValueError, TypeError, KeyError) as error:
         raise ValueError(f"{path}: {error}") from error
 

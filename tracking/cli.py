@@ -29,7 +29,9 @@ METHODS: Final = ("filter", "thesis")
 STREAM_ICG: Final = 16_000
 """Master clocks: a frame takes 3.8 ms on the link, and some more until the host asks for it."""
 PATIENCE: Final = 1.0
-"""Device seconds without a pose until a word is said about it."""
+"""Device seconds without a pose until a word is said about it …"""
+AGAIN: Final = 10.0
+"""… and from then on until it is said again."""
 
 _EPILOG: Final = """\
 [bold]Examples[/]
@@ -380,19 +382,25 @@ class _Watch:
     def __init__(self, console: Console, leds: LedMap) -> None:
         self._console, self._leds = console, leds
         self._frames = self._lit = 0
-        self._begun: int | None = None
-        self._told = False
+        from tracking.motion import Outcome
+
+        self._missing = Outcome.MISSING
+        self._seen: set[int] = set()
+        self._due: int | None = None  # when to say it, device time in ns
+        self._known = False
 
     def take(self, step: Step) -> None:
         """Look at what a frame led to."""
         self._frames += 1
         self._lit |= step.frame.leds
-        self._begun = step.t_ns if self._begun is None else self._begun
-        if step.estimate is not None:
-            self._told = True  # from now on, flags tell
-        elif not self._told and step.t_ns - self._begun >= PATIENCE * 1e9:
-            self._told = True
-            self._console.print(f"[yellow]no pose yet:[/] {self.why()}; going on")
+        self._seen |= {i.channel for i in step.innovations if i.outcome is not self._missing}
+        if self._due is None:
+            self._due = step.t_ns + round(PATIENCE * 1e9)
+        if self._known or step.estimate is not None:
+            self._known = True  # from now on, flags tell
+        elif step.t_ns >= self._due:
+            self._due = step.t_ns + round(AGAIN * 1e9)
+            self._console.print(f"[yellow]no pose yet:[/] {self.why()}; going on, Ctrl+C ends")
 
     def why(self) -> str:
         """Why there is no pose."""
@@ -405,9 +413,11 @@ class _Watch:
                 "with --stream into a session; for pairs of .dat files there is --method thesis"
             )
         channels = ", ".join(str(n) for n in self._leds.channels)
+        never = ", ".join(str(n) for n in self._leds.channels if n not in self._seen)
+        unseen = f" ({never} never)" if never else ""
         return (
-            f"{frames} in which LEDs {channels} were not seen well enough at once: are they on "
-            "and in sight, and is the LED map (--calibration, --leds) that of this room?"
+            f"{frames} in which LEDs {channels} were not seen well enough at once{unseen}: are they "
+            "on and in sight, and is the LED map (--calibration, --leds) that of this room?"
         )
 
 

@@ -529,6 +529,18 @@ def test_no_pose_is_told_while_it_lasts(run: Callable[..., Result]) -> None:
     assert len(result.lines) == 9
 
 
+def test_that_there_is_no_pose_is_said_again_and_of_which_leds(
+    run: Callable[..., Result], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a map of another room, say: nobody waits before a line that stands still."""
+    monkeypatch.setattr("tracking.cli.AGAIN", 0.4)
+    with SessionWriter("one.h5") as writer:
+        writer.append([frame(n, leds=1, exposures={0: 60}) for n in range(700)])
+    result = run("track --link replay one.h5 -c room.json --json")
+    assert result.err.count("no pose yet") > 2
+    assert "(1 never)" in " ".join(result.err.split())
+
+
 # --- the thesis's way -----------------------------------------------------------------------------
 
 
