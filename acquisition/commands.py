@@ -859,13 +859,14 @@ def convert(*, files: Sequence[str], overwrite: bool, quiet: bool) -> int:
             lost = lost + "; firmware, wiring, lens head and command" if sessions else lost
             if all(path.suffix.lower() == ".dat" for path in sources):
                 lost = ""
+    numbers = suffix not in SESSION_SUFFIXES | {".csv", ".dat"}
     console.print(
-        f"{escape(output)}: {written} frame{'' if written == 1 else 's'}"
+        f"{_where(output, written, session=not numbers)}: {written} frame{'' if written == 1 else 's'}"
         + (f"; [yellow]not kept:[/] {lost}" if lost else ""),
         highlight=False,
         soft_wrap=True,
     )
-    if suffix not in SESSION_SUFFIXES | {".csv", ".dat"}:
+    if numbers:
         _warn_of_older(console, output, written)
     return 0
 

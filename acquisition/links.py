@@ -370,7 +370,8 @@ def open_spi(argument: str | None = None, **options: Any) -> SpiLink:
     match = re.fullmatch(r"(?:/dev/spidev)?(\d{1,3})\.(\d{1,3})", argument or "0.0")
     if match is None:
         raise LinkUnavailable(
-            f"{argument!r} names no SPI device: give bus and chip select, such as 0.0"
+            f"{argument!r} names no SPI device: give bus and chip select, such as 0.0; a file needs "
+            "--link twin or --link replay"
         )
     return SpiLink(int(match[1]), int(match[2]), **options)
 
@@ -525,7 +526,7 @@ def open_replay(argument: str | None = None, **options: Any) -> ReplayLink:
     Parameters
     ----------
     argument : str
-        A session (HDF5), a `.dat` file, or the prefix of numbered `.dat` files (``output`` for
+        A session (HDF5), a `.csv` or `.dat` file, or the prefix of numbered `.dat` files (``output`` for
         ``output00001.dat`` and so on).
     **options
         `loop` and `realtime` of `ReplayLink`.
@@ -546,6 +547,10 @@ def open_replay(argument: str | None = None, **options: Any) -> ReplayLink:
             start = file.read(4)
         if start == b"\x89HDF":
             return _session(path, options)
+        if path.suffix.lower() == ".csv":
+            from acquisition.tables import read_csv
+
+            return ReplayLink(read_csv(path), **options)
         return ReplayLink(_dat([path]), **options)
     except OSError as error:
         raise LinkUnavailable(f"{argument} cannot be read: {error.strerror or error}") from error

@@ -5,7 +5,7 @@ Nothing slow is imported before it runs, so that ``linetrack build --help`` answ
 
 from __future__ import annotations
 
-from pathlib import Path
+from pathlib import Path  # noqa: TC003  # typer reads annotations
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
@@ -128,12 +128,9 @@ def _tell(package: Package, console: Console) -> None:
 
 def _design(head: str) -> Design:
     """The head: a design by its name, or from its file."""
-    from raytransfer.designs import DESIGNS, load_design
+    from raytransfer.designs import find_design
 
-    if head in DESIGNS:
-        return DESIGNS[head]
-    if not Path(head).is_file():
-        raise UsageError(
-            f"{head}: neither a design file nor one of the designs {', '.join(DESIGNS)}"
-        )
-    return load_design(head)
+    try:
+        return find_design(head)
+    except LookupError as error:
+        raise UsageError(str(error)) from error

@@ -32,6 +32,7 @@ import os
 import tempfile
 import tomllib
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Self
@@ -210,8 +211,36 @@ def load_design(path: str | os.PathLike[str] | Traversable) -> Design:
     data = file.read_bytes()
     try:
         return Design.from_dict(tomllib.loads(data.decode("utf-8")))
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{file}: no design file, which is TOML ({error})") from error
     except (ValueError, TypeError) as error:
         raise ValueError(f"{file}: {error}") from error
+
+
+def find_design(name: str, folder: str | os.PathLike[str] = ".") -> Design:
+    """Return the design that a name stands for: one of `DESIGNS`, or a file.
+
+    Parameters
+    ----------
+    name : str
+    folder : str or path-like
+        Where a relative path begins.
+
+    Raises
+    ------
+    LookupError
+        If it is neither.
+    ValueError, OSError
+        As `load_design`.
+    """
+    if name in DESIGNS:
+        return DESIGNS[name]
+    path = Path(folder, name)
+    if not path.is_file():
+        raise LookupError(
+            f"{name}: neither a design file nor one of the designs {', '.join(DESIGNS)}"
+        )
+    return load_design(path)
 
 
 def design_text(design: Design) -> str:
@@ -328,8 +357,12 @@ class Table:
     def of(self, needed: set[str]) -> None:
         """Refuse a table that lacks one of these keys."""
         self._needed = needed
-        if missing := needed - set(self.data):
-            raise ValueError(f"{self.where}missing: {', '.join(sorted(missing))}")
+        if missing := sorted(needed - set(self.data)):
+            slips = [
+                n for name in missing for n in get_close_matches(name, set(self.data) - needed)
+            ]
+            meant = f"; was {slips[0]} meant to be it?" if slips else ""
+            raise ValueError(f"{self.where}missing: {', '.join(missing)}{meant}")
 
     def and_maybe(self, more: set[str]) -> None:
         """Refuse a table with any but the needed keys and these."""

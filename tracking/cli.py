@@ -6,7 +6,7 @@ Nothing slow is imported before it runs, so that ``linetrack track --help`` answ
 from __future__ import annotations
 
 import sys
-from pathlib import Path
+from pathlib import Path  # noqa: TC003  # typer reads annotations
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
@@ -14,7 +14,7 @@ import typer
 from acquisition.cli import DOUBTFUL, INTERRUPTED, UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from rich.console import Console
 
@@ -84,7 +84,7 @@ def track(
             "--udp",
             metavar="HOST:PORT",
             help="The JSON object as a UDP datagram. If the network refuses some, the exit code is "
-            f"{DOUBTFUL}.",
+            f"{DOUBTFUL}; whether anybody listens is not known.",
         ),
     ] = None,
     calibration: Annotated[
@@ -271,7 +271,7 @@ def _follow(
     with ExitStack() as stack:
         stack.callback(writer.close)
         device = stack.enter_context(open_device(link, argument))
-        known = _calibration(device, calibration, led_map, head)
+        known = _calibration(device, calibration, led_map, head, console)
         try:
             tracker = Tracker(
                 known,
@@ -347,7 +347,8 @@ def _thesis(
     if not number and count:
         raise LinkError("the link had no two frames to send: is the recording empty?")
     if not quiet:
-        typer.echo(f"{number} positions, {invalid} invalid", err=True)
+        unit = "x and y, mm" if mapping else "middle of the two spikes and their distance, pixels"
+        typer.echo(f"{number} positions ({unit}), {invalid} invalid", err=True)
     return DOUBTFUL if invalid or number < count else 0
 
 
@@ -463,7 +464,7 @@ def read_leds(path: Path) -> LedMap:
 
 
 def _calibration(
-    device: Link, path: Path | None, leds: LedMap | None, head: str | None
+    device: Link, path: Path | None, leds: LedMap | None, head: str | None, console: Console
 ) -> Calibration:
     """What is known of camera and LEDs: measured, or nominal."""
     from dataclasses import replace
@@ -476,32 +477,59 @@ def _calibration(
             raise UsageError(f"--head {head}: the calibration has a camera already; one of the two")
         measured = load_calibration(path)
         return measured if leds is None else replace(measured, leds=leds)
-    camera = nominal_camera(_design(device, head))
+    camera = nominal_camera(design(getattr(device, "lens_system", {}), head, console))
     return Calibration(camera, _leds(device) if leds is None else leds)
 
 
-def _design(device: Link, head: str | None) -> Design:
-    """The lens head: the one named, or what the link knows, or the thesis's."""
-    from raytransfer.designs import DESIGNS, Design, load_design
+def design(about: Mapping[str, Any], head: str | None, console: Console) -> Design:
+    """Return the lens head: the one named, or the one described, or the thesis's.
 
+    Where both are there and differ, that is said: poses would come out wrong, and look right.
+
+    Parameters
+    ----------
+    about : mapping
+        ``lens_system`` of a link or of a session; may be empty.
+    head : str, optional
+        A design, or its file.
+    console : Console
+        To say it on.
+
+    Raises
+    ------
+    UsageError
+        There is none of that name, or what is described is no design.
+    """
+    from rich.markup import escape
+
+    from raytransfer.designs import DESIGNS, Design, find_design
+
+    known: Design | None = None
+    why = ""
+    if about:
+        try:
+            known = Design.from_dict(about["description"])
+        except (ValueError, TypeError, KeyError) as error:
+            why = str(error)
     if head is not None:
-        if head in DESIGNS:
-            return DESIGNS[head]
-        if not Path(head).is_file():
-            raise UsageError(
-                f"--head {head}: neither a design file nor one of the designs {', '.join(DESIGNS)}"
+        try:
+            named = find_design(head)
+        except LookupError as error:
+            raise UsageError(f"--head {error}") from error
+        if known is not None and (named.system, named.sensor) != (known.system, known.sensor):
+            console.quiet, quiet = False, console.quiet  # it is no summary
+            console.print(
+                f"[yellow]--head {escape(head)} is not the head that the frames come from[/]: "
+                f"that is {escape(known.system.name)}, which is taken without --head"
             )
-        return load_design(head)
-    about = getattr(device, "lens_system", {})
-    if not about:
-        return DESIGNS["thesis"]
-    try:
-        return Design.from_dict(about["description"])
-    except (ValueError, TypeError, KeyError) as error:
+            console.quiet = quiet
+        return named
+    if why:
         raise UsageError(
             f"the head described in the recording, {about.get('name', '')!r}, is no design "
-            f"({error}): give --head or --calibration"
-        ) from error
+            f"({why}): give --head or --calibration"
+        )
+    return known or DESIGNS["thesis"]
 
 
 def _leds(device: Link) -> LedMap:

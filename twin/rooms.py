@@ -56,7 +56,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 import numpy as np
 
 from raytransfer import _checks as check
-from raytransfer.designs import DESIGNS, Table, load_design
+from raytransfer.designs import Table, find_design
 from twin.world import STRAIGHT, Led, Mount, Occlusion, Pose, RandomOcclusions, Wall, World
 
 if TYPE_CHECKING:
@@ -155,7 +155,9 @@ def load_room(room: str | os.PathLike[str]) -> Room:
     data = file.read_bytes()
     try:
         return _room(tomllib.loads(data.decode("utf-8")), Path(str(file)).parent)
-    except (ValueError, TypeError) as error:
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{file}: no room file, which is TOML ({error})") from error
+    except (ValueError, TypeError, LookupError) as error:
         raise ValueError(f"{file}: {error}") from error
 
 
@@ -311,7 +313,7 @@ def _room(data: dict[str, Any], folder: Path) -> Room:
     seed = table.get("seed", int) if "seed" in data else 1304
     if seed < 0 or isinstance(seed, bool):
         raise ValueError(f"seed = {seed!r}: allowed are whole numbers from 0 on")
-    design = _head(table.get("head", str), folder)
+    design = find_design(table.get("head", str), folder)
     nominal = _leds(table)
     error = table.number("placement_error") if "placement_error" in data else 0.0
     world = World(
@@ -328,17 +330,6 @@ def _room(data: dict[str, Any], folder: Path) -> Room:
     )
     notes = table.get("notes", str) if "notes" in data else ""
     return Room(table.get("name", str), nominal, world, seed, notes)
-
-
-def _head(name: str, folder: Path) -> Any:
-    if name in DESIGNS:
-        return DESIGNS[name]
-    if not (folder / name).is_file():
-        raise ValueError(
-            f"head = {name!r}: neither a design file in {folder} nor one of the designs "
-            f"{', '.join(DESIGNS)}"
-        )
-    return load_design(folder / name)
 
 
 def _all(table: Table, key: str) -> list[Table]:

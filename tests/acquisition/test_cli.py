@@ -580,7 +580,10 @@ def test_convert_there_and_back(run: Callable[..., Result]) -> None:
         assert list(session) == FRAMES
         assert session.metadata.extra == {"converted_from": ["run.csv"]}
     result = run("convert", "back.h5", "f")
-    assert "not kept: the frames' numbers, LEDs, times and flags" in result.err
+    assert (
+        "f00001.dat to f00060.dat: 60 frames; not kept: the frames' numbers, LEDs, times and flags"
+        in result.err
+    )
     result = run("convert", *(f"f{n:05d}.dat" for n in (1, 2, 3)), "three.h5")
     assert result.err == "three.h5: 3 frames\n"
     with open_session("three.h5") as session:

@@ -30,6 +30,7 @@ from acquisition.links import (
 )
 from acquisition.protocol import Command, Mode
 from acquisition.session import Metadata, SessionWriter
+from acquisition.tables import csv_writer
 from tests.acquisition.fake_mcu import FakeMcu, elements_at
 
 if TYPE_CHECKING:
@@ -409,7 +410,11 @@ def test_replay_of_files(tmp_path: Path) -> None:
         write_dat(numbered(prefix, number), frame)
     with SessionWriter(tmp_path / "run.h5") as writer:
         writer.append(frames)
-    same(list(capture(open_replay(str(tmp_path / "run.h5")), ORIGINAL)), frames)
+    with csv_writer(tmp_path / "run.csv") as write:
+        for frame in frames:
+            write(frame)
+    for name in ("run.h5", "run.csv"):
+        same(list(capture(open_replay(str(tmp_path / name)), ORIGINAL)), frames)
     unlit = [frame.replaced(leds=0) for frame in frames]  # such files do not tell
     same(list(capture(open_replay(str(prefix)), ORIGINAL)), unlit)
     one = Command(100, 30000, 1)

@@ -28,7 +28,7 @@ PLAN = package.make_plan
 @pytest.fixture(scope="session")
 def plan() -> package.Plan:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(shutil, "which", lambda _: None)
+        patch.setattr(shutil, "which", lambda *_, **__: None)
         return PLAN(DESIGNS["thesis"].system, variant="thesis")
 
 

@@ -53,7 +53,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Package:
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without build123d and ngspice, and with small pictures: the rest is as always."""
     monkeypatch.setitem(sys.modules, "build123d", None)
-    monkeypatch.setattr(shutil, "which", lambda _: None)
+    monkeypatch.setattr(shutil, "which", lambda *_, **__: None)
     blank = np.zeros((2, 2, 3), dtype=np.uint8)
     monkeypatch.setattr(instructions, "picture", lambda *_, **__: blank)
 

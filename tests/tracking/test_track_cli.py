@@ -13,6 +13,7 @@ import socket
 import subprocess
 import sys
 import time
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -24,6 +25,7 @@ from acquisition import cli
 from acquisition.dat import DatWriter
 from acquisition.frames import ELEMENTS, LEADING, PIXELS, Frame, FrameFlags
 from acquisition.session import Metadata, SessionWriter
+from raytransfer.designs import DESIGNS, design_text
 from tracking.calibration import Calibration
 from tracking.camera import Camera
 from tracking.cli import read_leds
@@ -433,6 +435,21 @@ def test_the_head_comes_with_the_recording(run: Callable[..., Result]) -> None:
     assert run("track --link replay none.h5 --head thesis").code == 0
 
 
+def test_another_head_than_the_recordings_is_told(run: Callable[..., Result]) -> None:
+    """With it poses come out that are wrong and look right."""
+    text = design_text(DESIGNS["slit-4mm"])
+    about = Metadata(lens_system={"name": "slit", "description": tomllib.loads(text)})
+    with SessionWriter("slit.h5", about) as file:
+        file.append([frame(n) for n in range(6)])
+    result = run("track --link replay slit.h5 --head thesis --quiet")
+    assert result.code == 0
+    assert "--head thesis is not the head that the frames come from: that is head" in " ".join(
+        result.err.split()
+    )
+    for same in ("", " --head slit-4mm"):
+        assert run(f"track --link replay slit.h5 --quiet{same}").err == ""
+
+
 @pytest.mark.parametrize(
     ("line", "code", "message"),
     [
@@ -552,7 +569,7 @@ def test_the_thesiss_method(run: Callable[..., Result]) -> None:
         x, y = (float(word) for word in line.split())
         assert abs(x - 1855.5) < 5  # midpoint in the file's lines: 32 more than the pixel
         assert abs(abs(y) - 1377) < 30
-    assert result.err == "3 positions, 0 invalid\n"
+    assert re.fullmatch(r"3 positions \(.*, pixels\), 0 invalid\n", result.err)
 
 
 def test_the_thesiss_method_in_millimetres(run: Callable[..., Result], tmp_path: Path) -> None:

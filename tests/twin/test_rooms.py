@@ -216,14 +216,15 @@ def test_wrong_rooms_are_told_where_and_why(
     [
         ('format = "linetrack room"', 'format = "linetrack design"', "no room file"),
         ("version = 1", "version = 2", "written by a later one"),
-        ('head = "slit-4mm"', 'head = "slit"', "neither a design file in"),
+        ('head = "slit-4mm"', 'head = "slit"', "slit: neither a design file nor"),
         ("channel = 4", "channel = 64", "led 1, .*0 to 63"),
         ("channel = 4", "channel = 2", "used once"),
         ("position = [250, 0, 0]", "position = [250, 0]", "led 2, .*x, y and z"),
         ("position = [250, 0, 0]", "", "led 2, missing: position"),
         ("power = 0.5", "watts = 0.5", "led 2, unknown: watts"),
         ('name = "plain"', "", "missing: name"),
-        ("version = 1", "version = ", "Invalid value"),
+        ('head = "slit-4mm"', 'haed = "slit-4mm"', "missing: head; was haed meant to be it"),
+        ("version = 1", "version = ", "no room file, which is TOML .*Invalid value"),
     ],
 )
 def test_wrong_files_are_told_so(tmp_path: Path, before: str, after: str, message: str) -> None:
