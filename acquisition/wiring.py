@@ -263,6 +263,8 @@ class Wiring:
     direction : int
         +1: pixel 1 is at the -x end of the sensor line; -1: at its +x end.
     connectors : tuple of Connector
+    places : mapping of str to mapping of str to str
+        By board and pin: where on that board the pin comes out, for boards that are bought.
     """
 
     mcu: Mcu
@@ -271,6 +273,22 @@ class Wiring:
     inverted: bool
     direction: int
     connectors: tuple[Connector, ...]
+    places: Mapping[str, Mapping[str, str]]
+
+    def rows(self, connector: Connector) -> list[tuple[str, str, str]]:
+        """Return a connector's wires for people: net, and at both ends the pin and its place."""
+        return [
+            (
+                net,
+                self._end(self.mcu.part, self.pins[net].name if net in self.pins else net),
+                self._end(connector.other, end),
+            )
+            for net, end in connector.wires
+        ]
+
+    def _end(self, board: str, pin: str) -> str:
+        place = self.places.get(board, {}).get(pin, "")
+        return f"{pin} ({place})" if place else pin
 
 
 def read(text: str) -> tuple[Wiring, Protocol]:
@@ -327,7 +345,13 @@ def read(text: str) -> tuple[Wiring, Protocol]:
         data["sensor"]["inverted"],
         data["sensor"]["direction"],
         connectors,
+        MappingProxyType({name: MappingProxyType(row) for name, row in data["places"].items()}),
     )
+    for connector in connectors:
+        for net, _ in connector.wires:
+            name = pins[net].name if net in pins else net
+            if name not in wiring.places[wiring.mcu.part]:
+                raise WiringError(f"{connector.name}: places has no {name} of {wiring.mcu.part}")
     protocol = _protocol(data["protocol"])
     _check_constants(wiring, protocol)
     return wiring, protocol
@@ -551,11 +575,7 @@ def markdown() -> str:
         title = connector.name
         if connector.table is not None:
             title += f" (thesis, table {connector.table})"
-        rows = [("Net", WIRING.mcu.part, connector.other)]
-        rows += [
-            (net, WIRING.pins[net].name if net in WIRING.pins else net, end)
-            for net, end in connector.wires
-        ]
+        rows = [("Net", WIRING.mcu.part, connector.other), *WIRING.rows(connector)]
         parts.append(f"**{title}**\n\n{_table(rows)}")
     return "\n\n".join(parts) + "\n"
 

@@ -380,12 +380,10 @@ def _wiring(plan: Plan) -> str:
     for connector in WIRING.connectors:
         if connector.table is None:
             continue  # an extension, of which nothing is in the package
-        rows = [
-            (net, WIRING.pins[net].name if net in WIRING.pins else net, end)
-            for net, end in connector.wires
-        ]
         title = f"{connector.name} (thesis, table {connector.table})"
-        text += _table(("Net", WIRING.mcu.part, connector.other), rows, "lll", caption=title)
+        text += _table(
+            ("Net", WIRING.mcu.part, connector.other), WIRING.rows(connector), "lll", caption=title
+        )
     board = plan.boards[-1]
     (control,) = (c for c in WIRING.connectors if c.other == board.connectors["P1"].wiring)
     nets = {f"LED {end}": net for net, end in control.wires}

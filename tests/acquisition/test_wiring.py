@@ -41,6 +41,13 @@ def test_pins_of_the_thesis() -> None:
     assert {c.table for c in WIRING.connectors} == {"4.6", "4.7", "4.8", None}
 
 
+def test_places_on_the_boards_are_told() -> None:
+    (host,) = (c for c in WIRING.connectors if c.table == "4.6")
+    assert WIRING.rows(host)[0] == ("MOSI", "PB15 (CN10-26)", "GPIO10 (pin 19)")
+    for places in WIRING.places.values():
+        assert len(set(places.values())) == len(places)
+
+
 def test_constants() -> None:
     assert PROTOCOL.original_size == 7388
     assert PROTOCOL.stream.frame_size == 7424
@@ -115,6 +122,7 @@ def test_standard_library_only() -> None:
         ('sync      = { pin = "PB1"', 'sync      = { pin = "PB0"', "PB0 is both fM and sync"),
         ("sh_pulse = 8", "sh_pulse = 19", "SH pulse ends after"),
         ("master_clock = 4_000_000", "master_clock = 3_900_000", "does not divide"),
+        ('PB2 = "CN10-22"', "", "places has no PB2 of STM32F401RE"),
     ],
 )
 def test_what_cannot_be_built_is_refused(old: str, new: str, message: str) -> None:
