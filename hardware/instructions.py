@@ -387,6 +387,12 @@ def _wiring(plan: Plan) -> str:
     board = plan.boards[-1]
     (control,) = (c for c in WIRING.connectors if c.other == board.connectors["P1"].wiring)
     nets = {f"LED {end}": net for net, end in control.wires}
+    free = [pin for pin in WIRING.leds.gpio if pin.net not in nets.values()]
+    unlit = [plug.to.removeprefix("LED ") for plug in board.leds if plug.to not in nets]
+    more = ", ".join(
+        f"{pin.net} ({pin.name}, {WIRING.places[WIRING.mcu.part][pin.name]}) to {end}"
+        for pin, end in zip(free, unlit, strict=True)
+    )
     sockets = [
         (reference, plug.to, nets.get(plug.to, ""), *(name for name, _ in plug.pins))
         for reference, plug in board.connectors.items()
@@ -397,6 +403,14 @@ def _wiring(plan: Plan) -> str:
         text
         + _table(columns, sockets, "lllll", caption=f"{board.title} to LEDs and their supply")
         + """
+<p>Two LEDs, as the thesis wires them, tell a position whose heading is known. For the three or more that tell the
+heading as well, wire further outputs of the microcontroller to the control board's inputs, """
+        + more
+        + """, and a
+LED to each one's socket; nothing else changes.</p>
+<p>The LED lit by led0 is channel 0 of the programs, that by led1 channel 1. <code>linetrack track</code> takes them to
+stand 500 mm apart, channel 0 on the right for who looks at them from the tracker, unless it is told where they are
+(<code>--leds</code>).</p>
 <p>The same tables, and those of extensions, are in <code>wiring/wiring.md</code>; <code>wiring/wiring.h</code> is the header
 that the firmware is compiled with. All come from one file, so that they agree.</p>"""
     )
@@ -418,10 +432,13 @@ def _first_light(plan: Plan) -> str:
             "that is all 0 or all 65535 means a wrong or loose wire; a saturated one means room light."
         ),
         (
-            f"Now the LEDs' supply: {plan.led_supply:g} V, limited to {ampere:g} A. Plug in one LED; it "
-            f"must stay dark while nothing is captured.{source}"
+            f"Now the LEDs' supply: {plan.led_supply:g} V, limited to {ampere:g} A, which is one LED's. Plug "
+            f"in one; it must stay dark while nothing is captured.{source}"
         ),
-        "Capture again: each LED makes one spike.",
+        (
+            "Capture again: each LED makes one spike. linetrack track lights several at once, and "
+            f"each takes its {ampere:g} A."
+        ),
     ]
     items = "".join(f"<li>{escape(step)}</li>" for step in steps)
     return f"""
