@@ -57,8 +57,9 @@ run: setup
 	@echo "the chart as a picture: build/output.png"
 	$(BIN)/python -m twin.experiments --output build
 
-# matrices are small: BLAS's threads cost more than they bring
+# matrices are small: BLAS's threads cost more than they bring; sums rounded as in the notebooks
 test: export OPENBLAS_NUM_THREADS = 1
+test: export OPENBLAS_CORETYPE = Haswell
 test: setup lint
 	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 

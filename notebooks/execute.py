@@ -23,6 +23,9 @@ from nbclient import NotebookClient
 
 AT_ONCE = min(os.cpu_count() or 1, 4)
 
+ROUNDING = {"OPENBLAS_NUM_THREADS": "1", "OPENBLAS_CORETYPE": "Haswell"}
+"""Sums are rounded otherwise on several threads, and by what OpenBLAS has for newer processors."""
+
 WIDGET_STATE = "application/vnd.jupyter.widget-state+json"
 
 
@@ -41,9 +44,8 @@ def executed(path: Path) -> str:
         resources={"metadata": {"path": str(path.parent)}},
     )
     with tempfile.TemporaryDirectory(prefix="ipython-") as profile:
-        # not the user's own profile; on several threads sums are rounded otherwise
-        environment = {"IPYTHONDIR": profile, "OPENBLAS_NUM_THREADS": "1"}
-        client.execute(env={**os.environ, **environment})
+        # not the user's own profile
+        client.execute(env={**os.environ, **ROUNDING, "IPYTHONDIR": profile})
     for number, cell in enumerate(notebook.cells, start=1):
         cell.id = f"cell-{number:02d}"
         cell.metadata = {key: value for key, value in cell.metadata.items() if key == "tags"}

@@ -205,27 +205,30 @@ def expect(state, cov, leds, normals, lens, last, pixels, sigmas, visible):
 
 
 @_compile
-def fit(state, basis, prior, ages, rows, pixels, variances, leds, lens, information):
-    """Fit a straight path at constant rates to spikes of some time; returns χ², NaN if it fails.
+def fit(state, basis, prior, density, blur, ages, rows, pixels, variances, leds, lens, information):
+    """Fit a path to spikes of some time; returns χ², NaN if it fails.
 
-    Ages are times minus that of the state, s. What is sought are multiples of the columns of basis,
-    to be added to the state: prior has the information that they are 0. Gauss–Newton with halved
+    Ages are times minus that of the state, s, 0 or less. What is sought are multiples of the
+    columns of basis, to be added to the state: prior has the information that they are 0. The path
+    goes at constant rates but for white acceleration of this density, which moves spikes of about
+    the same time alike; LEDs are off their places by a variance of blur. Gauss–Newton with halved
     steps; information gets the normal matrix.
     """
     unknowns = basis.shape[1]
+    count = len(pixels)
     row = np.empty(STATES)
-    slopes = np.empty(unknowns)
+    residuals, slopes, pose = np.empty(count), np.empty((count, unknowns)), np.empty((count, 3))
+    noise = np.zeros((count, count))
     start = state.copy()
     found, at, step = np.zeros(unknowns), np.zeros(unknowns), np.zeros(unknowns)
     best = math.inf
     for _ in range(30):
-        normal = prior.copy()
         right = -(prior @ at)
         cost = -(at @ right)
         chi = 0.0
         now = start + basis @ at
         moved = now.copy()
-        for n in range(len(pixels)):
+        for n in range(count):
             for i in range(3):
                 moved[i] = now[i] + ages[n] * now[i + 3]
             predicted = project(moved, leds[rows[n]], lens, row)
@@ -233,14 +236,30 @@ def fit(state, basis, prior, ages, rows, pixels, variances, leds, lens, informat
                 chi = math.inf
                 break
             for i in range(3):
+                pose[n, i] = row[i]
                 row[i + 3] = ages[n] * row[i]
-            slopes[:] = row @ basis
-            residual = pixels[n] - predicted
-            chi += residual * residual / variances[n]
-            for i in range(unknowns):
-                right[i] += slopes[i] * residual / variances[n]
-                for j in range(unknowns):
-                    normal[i, j] += slopes[i] * slopes[j] / variances[n]
+            slopes[n] = row @ basis
+            residuals[n] = pixels[n] - predicted
+        if chi == 0.0:
+            if not noise[0, 0]:  # it hardly changes with the pose
+                for n in range(count):
+                    for m in range(n + 1):
+                        short, long = max(ages[n], ages[m]), min(ages[n], ages[m])
+                        shared = short * short * (short / 6 - long / 2)
+                        moves = pose[n, 0] * pose[m, 0] + pose[n, 1] * pose[m, 1]
+                        turns = pose[n, 2] * pose[m, 2]
+                        noise[n, m] = shared * (density[0] * moves + density[1] * turns)
+                        if rows[n] == rows[m]:
+                            noise[n, m] += blur * moves
+                    noise[n, n] += variances[n]
+                noise = np.linalg.cholesky(noise)
+            for n in range(count):  # to spikes of unit variance
+                for m in range(n):
+                    residuals[n] -= noise[n, m] * residuals[m]
+                    slopes[n] -= noise[n, m] * slopes[m]
+                residuals[n] /= noise[n, n]
+                slopes[n] /= noise[n, n]
+            chi = residuals @ residuals
         if not chi + cost < best:
             if np.abs(step[:2]).max() < 1e-3:
                 break
@@ -249,6 +268,8 @@ def fit(state, basis, prior, ages, rows, pixels, variances, leds, lens, informat
             continue
         gained = best - chi - cost
         best = chi + cost
+        normal = prior + slopes.T @ slopes
+        right += slopes.T @ residuals
         found[:] = at
         state[:] = now
         information[:] = normal

@@ -756,16 +756,20 @@ class MotionFilter:
         """Seek a pose in the spikes kept; the filter begins there."""
         while self._t - self._kept[0][0] > self._memory_ns:
             self._kept.popleft()
-        rows = [row for _, row, _, _ in self._kept]
-        different = len(set(rows))
+        rows = np.array([row for _, row, _, _ in self._kept])
+        ages = np.array([(t - self._t) * 1e-9 for t, *_ in self._kept])
+        kept = np.array(self._kept)
         # three LEDs fit some pose, whatever they say: better with more, or near the last pose
         waited = self._trusted is not None or 2 * (self._t - self._kept[0][0]) >= self._memory_ns
-        fewest = 4 if different > NEEDED else FEW if waited else SURE
-        if different < NEEDED or len(rows) < fewest:
-            return False
-        kept = np.array(self._kept)
-        ages = np.array([(t - self._t) * 1e-9 for t, *_ in self._kept])
-        return self._fitted(ages, np.array(rows), kept[:, 2], kept[:, 3])
+        for first in (0, len(rows) // 2):  # LEDs may have been confused when lock was lost
+            different = len(np.unique(rows[first:]))
+            more = different > NEEDED and not first
+            fewest = NEEDED + 1 if more else FEW if waited else SURE
+            if different < NEEDED or len(rows) - first < fewest:
+                return False
+            if self._fitted(ages[first:], rows[first:], kept[first:, 2], kept[first:, 3]):
+                return True
+        return False
 
     def _reachable(self, state: NDArray[np.float64]) -> bool:
         """Whether the tracker can have come here from where it was for certain."""
@@ -787,66 +791,88 @@ class MotionFilter:
         pixels: NDArray[np.float64],
         variances: NDArray[np.float64],
     ) -> bool:
-        """Fit a straight path at constant rates, leaving single LEDs out where it does not fit."""
-        turning = self._rates[1]
-        scale = abs(self.camera.scale)
-        # what acceleration adds, seen from a metre or more
-        linear, angular = self._density[:2]
-        cubes = np.abs(ages) ** 3 / 3
-        variances = variances + scale**2 * cubes * (angular + linear * 1e-6)
+        """Begin at a path that fits, leaving single LEDs out where none does."""
+        different = np.unique(rows)
+        use = np.ones(len(rows), bool)
+        found = self._path(use, ages, rows, pixels, variances)
+        if found is None and len(different) > NEEDED:
+            paths = []
+            for row in different:
+                use = rows != row
+                if (path := self._path(use, ages, rows, pixels, variances)) is not None:
+                    paths.append((use, path))
+            # three fit some path whatever they say: it must be the only one that can be reached
+            few = len(different) == NEEDED + 1
+            if not paths or (few and (len(paths) > 1 or self._trusted is None)):
+                return False
+            use, found = paths[0]
+            if few and use.sum() < FEW:
+                return False
+        if found is None:
+            return False
+        self._begin(self._t, *found)
+        self._seen = {int(rows[-1])}
+        self._witnesses = frozenset(rows[use].tolist())
+        self._speakers = len(self._witnesses)
+        return True
+
+    def _path(
+        self,
+        use: NDArray[np.bool_],
+        ages: NDArray[np.float64],
+        rows: NDArray[np.int64],
+        pixels: NDArray[np.float64],
+        variances: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """Fit a path to some of the spikes: its end and the covariance of that, if it is sure."""
+        ages, rows, pixels, variances = ages[use], rows[use], pixels[use], variances[use]
         # first a pose as if all were of one moment
-        moved = variances + (scale * ages * turning / 2) ** 2
-        for left_out in (-1, *np.unique(rows)):
-            use = rows != left_out
-            different = len(np.unique(rows[use]))
-            if left_out >= 0 and different < 4:
-                continue
-            newest = np.sort(
-                [np.flatnonzero(use & (rows == row))[-1] for row in np.unique(rows[use])]
+        moved = variances + (self.camera.scale * ages * self._rates[1] / 2) ** 2
+        different = np.unique(rows)
+        newest = np.sort([np.flatnonzero(rows == row)[-1] for row in different])
+        try:
+            fix = locate(
+                self.camera,
+                self.leds.positions[rows[newest]],
+                pixels[newest],
+                np.sqrt(moved[newest]),
+                height=self._height,
+                facings=self.leds.facings[rows[newest]],
             )
-            try:
-                fix = locate(
-                    self.camera,
-                    self.leds.positions[rows[newest]],
-                    pixels[newest],
-                    np.sqrt(moved[newest]),
-                    height=self._height,
-                    facings=self.leds.facings[rows[newest]],
-                )
-            except ValueError:  # no pose has the LEDs in front, and shining toward it
-                continue
-            if not np.isfinite(fix.covariance).all() or fix.flags & PoseFlags.AMBIGUOUS:
-                continue  # too few LEDs, or too near to each other
-            state = self._unmoved()
-            state[:3] = fix.x, fix.y, fix.heading
-            information = np.zeros_like(self._prior)
-            chi2 = self._kernels.fit(
-                state,
-                self._basis,
-                self._prior,
-                ages[use],
-                rows[use],
-                pixels[use],
-                variances[use],
-                self.leds.positions,
-                self._lens,
-                information,
-            )
-            degrees = int(use.sum()) - 3
-            if not chi2 <= degrees + 4 * math.sqrt(2 * degrees):
-                continue
-            covariance = np.asarray(np.linalg.inv(information), np.float64)
-            place, heading = (ROUGH**2 * limit for limit in self._limits)
-            if max(covariance[0, 0], covariance[1, 1]) > place or covariance[2, 2] > heading:
-                continue
-            if different < MANY and not self._reachable(state):
-                continue
-            self._begin(self._t, state, covariance)
-            self._seen = {int(rows[-1])}
-            self._witnesses = frozenset(rows[use].tolist())
-            self._speakers = len(self._witnesses)
-            return True
-        return False
+        except ValueError:  # no pose has the LEDs in front, and shining toward it
+            return None
+        state = self._unmoved()
+        state[:3] = fix.x, fix.y, fix.heading
+        if not np.isfinite(fix.covariance).all() or fix.flags & PoseFlags.AMBIGUOUS:
+            # too few LEDs, or too near to each other, or moved too far between their spikes
+            if self._trusted is None or not self._reachable(self._state):
+                return None
+            state[:3] = self._state[:3]
+        information = np.zeros_like(self._prior)
+        chi2 = self._kernels.fit(
+            state,
+            self._basis,
+            self._prior,
+            self._density,
+            self._blur,
+            ages,
+            rows,
+            pixels,
+            variances,
+            self.leds.positions,
+            self._lens,
+            information,
+        )
+        degrees = len(rows) - 3
+        if not chi2 <= degrees + 4 * math.sqrt(2 * degrees):
+            return None
+        covariance = np.asarray(np.linalg.inv(information), np.float64)
+        place, heading = (ROUGH**2 * limit for limit in self._limits)
+        if max(covariance[0, 0], covariance[1, 1]) > place or covariance[2, 2] > heading:
+            return None
+        if len(different) < MANY and not self._reachable(state):
+            return None
+        return state, covariance
 
 
 def load_kernels() -> Any:

@@ -713,6 +713,97 @@ def test_few_leds_are_not_believed_far_from_where_the_tracker_was() -> None:
         assert np.hypot(*(motion.state[:2] - there[:2])) < 10
 
 
+def found_while_moving(seed: Any, seen: Any, led_error: Any = 0.0) -> Any:
+    """Errors and covariance of the pose with which a filter begins, motion drawn from its model."""
+    random = np.random.default_rng(seed)
+    motion = MotionFilter(CAMERA, LEDS, model_error=0.0, led_error=led_error, speed=500.0)
+    places = LEDS.positions + random.normal(0.0, led_error, (len(LEDS), 3)) * [1, 1, 0]
+    leds = LedMap(LEDS.channels, places)
+    start = [50.0, 3500.0, 0.02, *(random.normal(size=3) * [500.0, 500.0, 1.5])]
+    for n, truth in enumerate(drawn(random, start, 135)):
+        row = seen[n % len(seen)]
+        motion.observe(n * FRAME, frame(truth, random, [row], leds=leds))
+        if motion._to_confirm:
+            return motion.state[:6] - truth, motion.covariance[:6, :6]
+    raise AssertionError("none in half a second")
+
+
+@pytest.mark.parametrize("led_error", [0.0, 0.5])
+def test_a_pose_found_while_moving_is_as_sure_as_stated(led_error: Any) -> None:
+    """From spikes of different times, between which the tracker went on."""
+    runs = 120
+    results = [found_while_moving(seed, [2, 4, 6, 3], led_error) for seed in range(runs)]
+    off, stated = (np.array(column) for column in zip(*results, strict=True))
+    errors = nees(off[:, :3], stated[:, :3, :3])  # χ² of three degrees of freedom
+    assert 1.8 < np.median(errors) < 3.0  # 2.4
+    assert np.mean(errors > 7.8) < 0.12  # 0.05
+
+
+def test_what_moves_all_spikes_alike_leaves_a_pose_sure() -> None:
+    """Acceleration that is common to spikes of about one time, not an error of each on its own."""
+    motion, random = MotionFilter(CAMERA, LEDS), np.random.default_rng(3)
+    pose = np.array([0.0, 4500.0, 0.0])
+    for n in range(21):
+        motion.observe(n * FRAME, frame(pose, random, [(1, 2, 7)[n % 3]]))
+    kept = np.array(motion._kept)
+    ages, rows = (kept[:, 0] - motion.t_ns) * 1e-9, kept[:, 1].astype(int)
+    found = motion._path(np.ones(21, bool), ages, rows, kept[:, 2], kept[:, 3])
+    assert found is not None
+    steps = np.diag([1e-2, 1e-2, 1e-6])
+    slopes = np.column_stack(
+        [(pixels(pose + s) - pixels(pose - s))[rows] / (2 * s.max()) for s in steps]
+    )
+    moved = np.abs(ages) ** 3 / 3 * (slopes**2 @ [1e6, 1e6, 1.0])
+    along = np.hstack([slopes, ages[:, None] * slopes]) / np.sqrt(kept[:, 3] + moved)[:, None]
+    prior = np.diag([0, 0, 0, 1e-6, 1e-6, 1.5**-2])
+    alone = np.sqrt(np.diag(np.linalg.inv(along.T @ along + prior)))
+    assert np.all(np.sqrt(np.diag(found[1]))[:3] < 0.5 * alone[:3])
+
+
+def test_leds_that_were_confused_are_forgotten_sooner() -> None:
+    """Several lit at once, one hidden and another reflected: each takes the next one's spike."""
+    pose = (100.0, 2500.0, 0.05)
+    motion, random = settled(pose=pose)
+    n = 30
+    while not motion.lost:
+        n += 1
+        motion.observe(n * FRAME, {0: MISSING})
+    seen = frame(pose, random)
+    channels = list(seen)
+    moved = dict(zip(channels, [seen[c] for c in channels[1:] + channels[:1]], strict=True))
+    motion.observe((n + 1) * FRAME, moved)
+    rows = on_line(pixels(pose))
+    first = n = n + 1
+    while motion.lost and n < first + 60:
+        n += 1
+        motion.observe(n * FRAME, frame(pose, random, rows[[n % len(rows)]]))
+    assert (n - first) * FRAME < 0.1e9  # not all of the memory
+    assert np.hypot(*(motion.state[:2] - pose[:2])) < 20
+
+
+def test_of_four_leds_that_fit_no_pose_the_one_that_lies_is_left_out() -> None:
+    """A reflection instead of an LED: three more fit a pose that can be reached, other threes not."""
+    pose = (100.0, 2500.0, 0.05)
+    rows = on_line(pixels(pose))[[0, 1, 3, 4]]
+    for wrong in range(4):
+        motion, random = settled(pose=pose)
+        n = 30
+        while not motion.lost:
+            n += 1
+            motion.observe(n * FRAME, {0: MISSING})
+        lost = n
+        while motion.lost and n < lost + 60:
+            n += 1
+            seen = frame(pose, random, rows[[n % 4]])
+            if n % 4 == wrong:
+                (channel,) = seen
+                seen[channel] = replace(seen[channel], position=seen[channel].position + 400.0)
+            motion.observe(n * FRAME, seen)
+        assert not motion.lost
+        assert motion.unchecked
+        assert np.hypot(*(motion.state[:2] - pose[:2])) < 20
+
+
 def test_three_leds_are_unchecked_until_a_fourth_agrees() -> None:
     """One of them a reflection: some pose fits, and is flagged; the fourth LED finds it out."""
     motion, random = MotionFilter(CAMERA, LEDS), np.random.default_rng(9)
