@@ -436,8 +436,8 @@ def _first_light(plan: Plan) -> str:
             f"in one; it must stay dark while nothing is captured.{source}"
         ),
         (
-            "Capture again: each LED makes one spike. linetrack track lights several at once, and "
-            f"each takes its {ampere:g} A."
+            "Capture again: each LED makes one spike. linetrack track lights several at once: raise "
+            f"the supply's limit to {ampere:g} A times the LEDs that are plugged in."
         ),
     ]
     items = "".join(f"<li>{escape(step)}</li>" for step in steps)

@@ -5,6 +5,8 @@ Nothing slow is imported before it runs, so that ``linetrack calibrate --help`` 
 
 from __future__ import annotations
 
+import json
+import math
 from pathlib import Path  # noqa: TC003  # typer reads annotations
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -43,7 +45,7 @@ def calibrate(
         typer.Argument(
             metavar="FILE",
             show_default=False,
-            help="Text: lines of a recording, the tracker's x and y there in mm, and its heading in "
+            help="Text: lines of a session (.h5), the tracker's x and y there in mm, and its heading in "
             "degrees, counter-clockwise from above; the heading may be left out. # begins a comment.",
         ),
     ],
@@ -110,12 +112,23 @@ def _run(
     from rich.console import Console
 
     from acquisition.session import open_session
-    from tracking.calibration import Calibration, bundle
+    from tracking.calibration import Calibration, UndeterminedError, bundle
     from tracking.spikes import SpikeFinder
     from tracking.survey import look, read_survey
 
-    if output.suffix != ".json":
-        raise UsageError(f"-o {output}: a calibration file ends in .json")
+    for name, value in (
+        ("place-error", place_error),
+        ("heading-error", heading_error),
+        ("led-error", led_error),
+    ):
+        if not value >= 0:
+            raise UsageError(f"--{name} {value}: allowed is 0 (known) and more")
+    if heading_error > 360:
+        raise UsageError(f"--heading-error {heading_error}: degrees are needed, up to 360")
+    if not math.isfinite(height):
+        raise UsageError(f"--height {height}: a number of mm is needed")
+    if output.suffix != ".json" or output.is_dir():
+        raise UsageError(f"-o {output}: a calibration is a file that ends in .json")
     if not output.parent.is_dir():
         raise UsageError(f"-o {output}: there is no folder {output.parent}; make it first")
     if output.exists() and not overwrite:
@@ -123,12 +136,14 @@ def _run(
     led_map, places = read_leds(leds), read_survey(survey)
     console = Console(stderr=True, highlight=False, soft_wrap=True)
     finder = SpikeFinder()
-    described: dict[Path, Any] = {}
+    described: dict[str, Mapping[str, Any]] = {}
     observations: list[Observation] = []
-    for place in places:
+    for number, place in enumerate(places, start=1):
         with open_session(place.recording) as session:
-            described[place.recording] = session.metadata.lens_system
+            about = session.metadata.lens_system
             sights = look(session, finder)
+        if about:
+            described.setdefault(json.dumps(about, sort_keys=True), about)
         if not sights:
             raise UsageError(
                 f"{place.recording}: no frame of one LED alone, as --leds 0:80,1:80,- gives them"
@@ -138,27 +153,44 @@ def _run(
                 f"{place.recording}: LED {unknown[0]} was lit, and {leds} does not have it"
             )
         if not quiet:
-            console.print(f"{place.recording.name}: {_seen(sights)}", markup=False)
+            console.print(f"{number}. {place.recording.name}: {_seen(sights)}", markup=False)
         try:
             observations.append(place.observed(sights, place_error, heading_error, height))
         except ValueError as error:
             raise UsageError(f"{survey}, line {place.line}: {error}") from error
-    first, *others = described
-    if head is None:
-        for other in others:
-            if described[other] != described[first]:
-                raise UsageError(
-                    f"{other} and {first} were made through different heads, as they say: one "
-                    "calibration is of one head; if it is the same, name it with --head"
-                )
-    nominal = Calibration.nominal(design(described[first], head, console), led_map)
-    made = f"{len(places)} places, {survey.name}."
+    heads = list(described.values()) or [{}]
+    if head is None and len(heads) > 1:
+        raise UsageError(
+            "the recordings say that they were made through different heads, "
+            f"{' and '.join(str(about.get('name', '')) for about in heads)}: one calibration is of "
+            "one head; if it is the same, name it with --head"
+        )
+    lens, *_ = [design(about, head) for about in heads]
+    nominal = Calibration.nominal(lens, led_map)
+    made = f"{len(places)} place{'' if len(places) == 1 else 's'}, {survey.name}."
     try:
         found = bundle(observations, led_map, nominal.camera, led_sigma=led_error, notes=made)
+    except UndeterminedError as error:
+        # what it advises in Python's terms
+        console.print(
+            f"linetrack: nothing is written: {error} What is known is said by --place-error, "
+            "--heading-error and --led-error; best are more places.",
+            style="red",
+            markup=False,
+        )
+        return FAILED
     except (ValueError, RuntimeError) as error:
-        console.print(f"linetrack: nothing is written: {error}", style="red", markup=False)
+        console.print(
+            f"linetrack: nothing is written: {error} (Observations are the survey's recordings, in "
+            "their order; lengths in mm, angles in rad.)",
+            style="red",
+            markup=False,
+        )
         return FAILED
     found.save(output)
+    seen = {channel for observation in observations for channel in observation.channels}
+    for channel in sorted(set(led_map.channels) - seen):
+        console.print(f"LED {channel} was never seen: its place is the map's", style="yellow")
     if not quiet:
         _tell(found, nominal, output, console)
     return 0
@@ -189,9 +221,11 @@ def _tell(found: Calibration, nominal: Calibration, output: Path, console: Conso
         if found.sigma(name) > 0
     ]
     off = np.linalg.norm((found.leds.positions - nominal.leds.positions)[:, :2], axis=1)
-    lines.append(
-        f"  LEDs are off the map by {np.median(off):.1f} mm (median), {off.max():.1f} (most)"
-    )
+    off = off[[found.sigma(f"LED {n} x") > 0 for n in found.leds.channels]]
+    if len(off):
+        lines.append(
+            f"  LEDs are off the map by {np.median(off):.1f} mm (median), {off.max():.1f} (most)"
+        )
     for line in [*lines, found.notes]:
         console.print(line, markup=False)
 

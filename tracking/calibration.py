@@ -1083,7 +1083,9 @@ class _Bundle:
         jacobian[:count] *= np.sqrt(_loss(loss, (residuals / spread / LOSS_SCALE) ** 2)[1])[:, None]
         norms = np.linalg.norm(jacobian, axis=0)
         norms[norms == 0] = 1
-        _, strength, basis = np.linalg.svd(jacobian / norms, full_matrices=False)
+        lacking = max(jacobian.shape[1] - len(jacobian), 0)  # fewer numbers than are sought
+        square = np.pad(jacobian / norms, ((0, lacking), (0, 0)))
+        _, strength, basis = np.linalg.svd(square, full_matrices=False)
         told = strength > RANK * strength[0]
         loose = (basis[~told] ** 2).sum(axis=0)
         half = basis[told] / strength[told, None] / norms

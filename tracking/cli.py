@@ -271,7 +271,7 @@ def _follow(
     with ExitStack() as stack:
         stack.callback(writer.close)
         device = stack.enter_context(open_device(link, argument))
-        known = _calibration(device, calibration, led_map, head, console)
+        known = _calibration(device, calibration, led_map, head)
         try:
             tracker = Tracker(
                 known,
@@ -464,7 +464,7 @@ def read_leds(path: Path) -> LedMap:
 
 
 def _calibration(
-    device: Link, path: Path | None, leds: LedMap | None, head: str | None, console: Console
+    device: Link, path: Path | None, leds: LedMap | None, head: str | None
 ) -> Calibration:
     """What is known of camera and LEDs: measured, or nominal."""
     from dataclasses import replace
@@ -477,11 +477,11 @@ def _calibration(
             raise UsageError(f"--head {head}: the calibration has a camera already; one of the two")
         measured = load_calibration(path)
         return measured if leds is None else replace(measured, leds=leds)
-    camera = nominal_camera(design(getattr(device, "lens_system", {}), head, console))
+    camera = nominal_camera(design(getattr(device, "lens_system", {}), head))
     return Calibration(camera, _leds(device) if leds is None else leds)
 
 
-def design(about: Mapping[str, Any], head: str | None, console: Console) -> Design:
+def design(about: Mapping[str, Any], head: str | None) -> Design:
     """Return the lens head: the one named, or the one described, or the thesis's.
 
     Where both are there and differ, that is said: poses would come out wrong, and look right.
@@ -492,16 +492,12 @@ def design(about: Mapping[str, Any], head: str | None, console: Console) -> Desi
         ``lens_system`` of a link or of a session; may be empty.
     head : str, optional
         A design, or its file.
-    console : Console
-        To say it on.
 
     Raises
     ------
     UsageError
         There is none of that name, or what is described is no design.
     """
-    from rich.markup import escape
-
     from raytransfer.designs import DESIGNS, Design, find_design
 
     known: Design | None = None
@@ -517,12 +513,12 @@ def design(about: Mapping[str, Any], head: str | None, console: Console) -> Desi
         except LookupError as error:
             raise UsageError(f"--head {error}") from error
         if known is not None and (named.system, named.sensor) != (known.system, known.sensor):
-            console.quiet, quiet = False, console.quiet  # it is no summary
-            console.print(
-                f"[yellow]--head {escape(head)} is not the head that the frames come from[/]: "
-                f"that is {escape(known.system.name)}, which is taken without --head"
+            typer.secho(
+                f"--head {head} is not the head that the frames come from: that is "
+                f"{known.system.name}, which is taken without --head",
+                fg="yellow",
+                err=True,
             )
-            console.quiet = quiet
         return named
     if why:
         raise UsageError(

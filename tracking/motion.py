@@ -71,7 +71,8 @@ SPIKES = 40
 SURE = 20
 """So many are enough if they are of three LEDs, which fit some pose whatever they say …"""
 FEW = 7
-"""… or so many near the last pose, or when half the memory has passed without a fourth LED."""
+"""… or so many near the last pose, or when half the memory has passed without a fourth LED; or in
+the newer half of what is kept; or of the three that are left when one of four LEDs is left out."""
 ROUGH = 2.5
 """Times the uncertainty at which lock is lost that a pose may begin with."""
 MANY = 5
@@ -796,13 +797,15 @@ class MotionFilter:
         use = np.ones(len(rows), bool)
         found = self._path(use, ages, rows, pixels, variances)
         if found is None and len(different) > NEEDED:
+            # three fit some path whatever they say: it must be the only one that can be reached
+            few = len(different) == NEEDED + 1
             paths = []
             for row in different:
                 use = rows != row
                 if (path := self._path(use, ages, rows, pixels, variances)) is not None:
                     paths.append((use, path))
-            # three fit some path whatever they say: it must be the only one that can be reached
-            few = len(different) == NEEDED + 1
+                    if not few:
+                        break
             if not paths or (few and (len(paths) > 1 or self._trusted is None)):
                 return False
             use, found = paths[0]

@@ -77,37 +77,46 @@ class Place:
 def read_survey(path: Path) -> list[Place]:
     """Read a survey: lines of a recording, x and y (mm), and maybe a heading (degrees).
 
-    Recordings are relative to the survey's folder; names with blanks are quoted.
+    Recordings are relative to the survey's folder; names with a blank, a comma or # are quoted.
 
     Raises
     ------
     UsageError
-        It holds something else; the message names the line.
+        It holds something else, or names a recording that is not there, or one twice; the message
+        names the line.
     OSError
         It cannot be read.
     """
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise UsageError(f"{path}: it is no text; a survey names recordings and places") from error
-    places = []
+    places: list[Place] = []
     for number, line in enumerate(lines, start=1):
         try:
-            words = shlex.split(line.replace(",", " "), comments=True)
-            if not words:
+            cut = shlex.shlex(line, posix=True)
+            cut.whitespace, cut.whitespace_split = " \t,", True
+            if not (words := list(cut)):
                 continue
             name, x, y, *rest = words
             (heading,) = rest or ["nan"]
             place = Place(
                 number, path.parent / name, float(x), float(y), math.radians(float(heading))
             )
-            if not math.isfinite(place.x + place.y) or (rest and math.isnan(place.heading)):
+            told = (place.x, place.y, *([place.heading] if rest else []))
+            if not np.isfinite(told).all() or (rest and abs(place.heading) > 2 * math.pi):
                 raise ValueError
         except ValueError as error:
             raise UsageError(
                 f"{path}, line {number}: {line.strip()!r} is not recording, x, y in mm and heading "
                 "in degrees, such as spot01.h5 -400 1500 5"
             ) from error
+        if not place.recording.is_file():
+            raise UsageError(f"{path}, line {number}: there is no file {place.recording}")
+        if before := [other.line for other in places if other.recording == place.recording]:
+            raise UsageError(
+                f"{path}, line {number}: {name} stands in line {before[0]} too; one place each"
+            )
         places.append(place)
     if not places:
         raise UsageError(f"{path}: there is no recording in it")
@@ -136,7 +145,7 @@ def look(frames: Iterable[Frame], finder: SpikeFinder) -> dict[int, Sight]:
 
     Frames in which several LEDs are lit are left out: which is which is not known before there is a
     calibration. One without LEDs is subtracted from those that follow. Of several exposures of an
-    LED, that with the surest spikes is taken: the longest that saturates no pixel.
+    LED, that with the surest spikes is taken of those that do not saturate in most frames.
     """
     spikes: dict[tuple[int, int], list[Spike]] = {}
     unlit: Frame | None = None
@@ -173,6 +182,7 @@ def _sight(spikes: Sequence[Spike]) -> Sight:
     wanders = float(np.median(np.abs(places[good] - pixel)))
     if wanders > UNSTEADY:
         return Sight(math.nan, math.nan, f"wandering by {wanders:.1f} px")
-    sigma = np.median([spike.sigma for spike, ok in zip(spikes, good, strict=True) if ok])
-    # the median of a normal distribution spreads by that much more than the mean
-    return Sight(pixel, float(sigma) * math.sqrt(math.pi / 2 / np.count_nonzero(good)))
+    stated = np.median([spike.sigma for spike, ok in zip(spikes, good, strict=True) if ok])
+    # of a normal distribution, the deviation from its median and the spread of that
+    sigma = max(float(stated), 1.4826 * wanders)
+    return Sight(pixel, sigma * math.sqrt(math.pi / 2 / np.count_nonzero(good)))

@@ -157,7 +157,7 @@ def load_room(room: str | os.PathLike[str]) -> Room:
         return _room(tomllib.loads(data.decode("utf-8")), Path(str(file)).parent)
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"{file}: no room file, which is TOML ({error})") from error
-    except (ValueError, TypeError, LookupError) as error:
+    except (ValueError, TypeError) as error:
         raise ValueError(f"{file}: {error}") from error
 
 
@@ -313,7 +313,10 @@ def _room(data: dict[str, Any], folder: Path) -> Room:
     seed = table.get("seed", int) if "seed" in data else 1304
     if seed < 0 or isinstance(seed, bool):
         raise ValueError(f"seed = {seed!r}: allowed are whole numbers from 0 on")
-    design = find_design(table.get("head", str), folder)
+    try:
+        design = find_design(table.get("head", str), folder)
+    except LookupError as unknown:
+        raise ValueError(f"head = {unknown} (in {folder})") from unknown
     nominal = _leds(table)
     error = table.number("placement_error") if "placement_error" in data else 0.0
     world = World(

@@ -9,7 +9,16 @@ from scipy.stats import chi2  # type: ignore[import-untyped]
 from tracking.camera import Camera
 from tracking.evaluation import nees, nees_band
 from tracking.leds import LedMap
-from tracking.motion import CONFIRMATIONS, DOUBT, MANY, SQUARED, MotionFilter, Outcome, load_kernels
+from tracking.motion import (
+    CONFIRMATIONS,
+    DOUBT,
+    FEW,
+    MANY,
+    SQUARED,
+    MotionFilter,
+    Outcome,
+    load_kernels,
+)
 from tracking.poses import Fix, PoseFlags, Prior, optical
 from tracking.spikes import Spike, SpikeFlags
 
@@ -802,6 +811,29 @@ def test_of_four_leds_that_fit_no_pose_the_one_that_lies_is_left_out() -> None:
         assert not motion.lost
         assert motion.unchecked
         assert np.hypot(*(motion.state[:2] - pose[:2])) < 20
+
+
+def test_which_of_four_lies_is_not_guessed() -> None:
+    """Neither before any pose, when several threes fit; nor from a spike or two of each."""
+    pose = (100.0, 2500.0, 0.05)
+    rows = on_line(pixels(pose))[[0, 1, 3, 4]]
+    for known, spikes in ((False, 40), (True, FEW)):
+        motion, random = settled(pose=pose)
+        if not known:
+            motion = MotionFilter(CAMERA, LEDS)
+        n = 30
+        while not motion.lost:
+            n += 1
+            motion.observe(n * FRAME, {0: MISSING})
+        for _ in range(spikes):
+            n += 1
+            seen = frame(pose, random, rows[[n % 4]])
+            if n % 4 == 1:
+                (channel,) = seen
+                seen[channel] = replace(seen[channel], position=seen[channel].position + 400.0)
+            motion.observe(n * FRAME, seen)
+            assert not motion._to_confirm
+        assert motion.lost
 
 
 def test_three_leds_are_unchecked_until_a_fourth_agrees() -> None:

@@ -91,7 +91,7 @@ def test_from_recordings_to_a_calibration(
     leds = survey.folder / "leds.txt"
     code, said = run(survey.folder / "survey.txt", "--leds", leds, "-o", target, *known)
     assert code == 0, said
-    assert "spot 0.h5: used: 1, 2; saturated: 0; not seen: 3, 4" in said
+    assert "1. spot 0.h5: used: 1, 2; saturated: 0; not seen: 3, 4" in said
     found = load_calibration(target)
     off = found.leds.positions[:, :2] - survey.leds
     sigma = np.array([[found.sigma(f"LED {n} {axis}") for axis in "xy"] for n in range(5)])
@@ -105,17 +105,35 @@ def test_from_recordings_to_a_calibration(
     assert "room.json: exists; take another name, or --overwrite" in said
 
 
+@pytest.mark.parametrize("headings", [False, True])
+@pytest.mark.parametrize("places", [1, 2, 3])
 def test_what_is_not_determined_is_not_written(
-    survey: Survey, run: Callable[..., tuple[int, str]], tmp_path: Path
+    survey: Survey,
+    run: Callable[..., tuple[int, str]],
+    tmp_path: Path,
+    places: int,
+    headings: bool,
 ) -> None:
-    lines = (survey.folder / "survey.txt").read_text().splitlines()
+    lines = (survey.folder / "survey.txt").read_text().splitlines()[1 : 1 + places]
     short = survey.folder / "short.txt"
-    short.write_text("\n".join(line.rpartition(",")[0] for line in lines[1:4]))  # no headings
+    short.write_text("\n".join(n if headings else n.rpartition(",")[0] for n in lines))
     target = tmp_path / "room.json"
     code, said = run(short, "--leds", survey.folder / "leds.txt", "-o", target)
     assert code == cli.FAILED
     assert "nothing is written: " in said
+    assert "--heading-error" in said
     assert not list(tmp_path.iterdir())
+
+
+def test_without_options_it_does_for_the_documented_survey(
+    survey: Survey, run: Callable[..., tuple[int, str]], tmp_path: Path
+) -> None:
+    target = tmp_path / "room.json"
+    leds = survey.folder / "more.txt"
+    leds.write_text((survey.folder / "leds.txt").read_text() + "7 2000 0\n")
+    code, said = run(survey.folder / "survey.txt", "--leds", leds, "-o", target, "-q")
+    assert code == 0, said
+    assert said == "LED 7 was never seen: its place is the map's"
 
 
 # --- what a recording shows -----------------------------------------------------------------------
@@ -169,6 +187,14 @@ def test_of_several_exposures_the_longest_that_saturates_nothing_is_taken() -> N
     assert look(many(0, 1200.3, height=9000.0), finder)[0].why == "saturated"
 
 
+def test_a_drift_makes_it_less_sure() -> None:
+    finder = SpikeFinder()
+    still = look(many(0, 1200.3), finder)[0]
+    drifting = look([frame(0, 1200.0 + 0.2 * n, seed=n) for n in range(16)], finder)[0]
+    assert not drifting.why
+    assert drifting.sigma > 0.2 > 10 * still.sigma
+
+
 def test_what_is_of_no_use_is_named() -> None:
     finder = SpikeFinder()
     moved = [frame(0, 1200.0 + 5 * n, seed=n) for n in range(16)]
@@ -202,11 +228,17 @@ def test_what_shines_without_leds_is_subtracted() -> None:
         ("a.h5 1 nan", "line 1: 'a.h5 1 nan' is not"),
         ("a.h5 1 2 nan", "line 1: 'a.h5 1 2 nan' is not"),
         ("'a.h5 1 2", 'line 1: "\'a.h5 1 2" is not'),
+        ("a.h5 1 2 inf", "line 1: 'a.h5 1 2 inf' is not"),
+        ("a.h5 1 2 1500", "line 1: 'a.h5 1 2 1500' is not"),
+        ("# none\nb.h5 1 2", "line 2: there is no file .*b.h5"),
+        ("a.h5 1 2\n'b, #1.h5' 1 2\na.h5 3 4", "line 3: a.h5 stands in line 1 too"),
     ],
 )
 def test_surveys_that_are_refused(text: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "survey.txt"
-    path.write_text(text)
+    path.write_text(text, encoding="utf-8-sig")
+    for name in ("a.h5", "b, #1.h5"):
+        (tmp_path / name).touch()
     with pytest.raises(cli.UsageError, match=message):
         read_survey(path)
 
@@ -232,17 +264,20 @@ def test_errors_say_what_to_do(run: Callable[..., tuple[int, str]], tmp_path: Pa
     for line, options, code, message in (
         ("third.h5 0 1500", (), cli.USAGE, "third.h5: LED 2 was lit, and"),
         ("none.h5 0 1500", (), cli.USAGE, "none.h5: no frame of one LED alone"),
-        ("nothing.h5 0 1500", (), cli.FAILED, "nothing.h5: No such file"),
+        ("nothing.h5 0 1500", (), cli.USAGE, "line 1: there is no file"),
         ("leds.txt 0 1500", (), cli.FAILED, "leds.txt"),
-        ("good.h5 0 1500\nother.h5 0 1600", (), cli.USAGE, "different heads"),
+        ("good.h5 0 1500\nother.h5 0 1600", (), cli.USAGE, "different heads, a and b"),
         ("good.h5 0 1500", (), cli.USAGE, "'a', is no design"),
         ("good.h5 0 1500", ("--head", "no"), cli.USAGE, "--head no: neither a design file"),
-        ("good.h5 0 1500", ("--place-error", "-1"), cli.USAGE, "line 1: σ of x = -1.0"),
+        ("good.h5 0 1500", ("--place-error", "-1"), cli.USAGE, "--place-error -1.0: allowed is"),
+        ("good.h5 0 1500", ("--led-error", "nan"), cli.USAGE, "--led-error nan: allowed is"),
+        ("good.h5 0 1500", ("--heading-error", "400"), cli.USAGE, "degrees are needed, up to"),
+        ("good.h5 0 1500", ("--height", "inf"), cli.USAGE, "--height inf: a number of mm"),
     ):
         assert said(line, *options)[0] == code, line
         assert message in said(line, *options)[1]
     for output, message in (
-        (tmp_path / "room.txt", "a calibration file ends in .json"),
+        (tmp_path / "room.txt", "a calibration is a file that ends in .json"),
         (tmp_path / "no" / "room.json", "there is no folder"),
     ):
         code, text = said("good.h5 0 1500", output=output)

@@ -216,7 +216,7 @@ def test_wrong_rooms_are_told_where_and_why(
     [
         ('format = "linetrack room"', 'format = "linetrack design"', "no room file"),
         ("version = 1", "version = 2", "written by a later one"),
-        ('head = "slit-4mm"', 'head = "slit"', "slit: neither a design file nor"),
+        ('head = "slit-4mm"', 'head = "slit"', "head = slit: neither a design file nor"),
         ("channel = 4", "channel = 64", "led 1, .*0 to 63"),
         ("channel = 4", "channel = 2", "used once"),
         ("position = [250, 0, 0]", "position = [250, 0]", "led 2, .*x, y and z"),
